@@ -20,7 +20,7 @@ import tomli_w
 from scipy.optimize import minimize_scalar
 
 from autotune.arguments import checked
-from autotune.arrays import FloatArray, is_real
+from autotune.arrays import BoolArray, FloatArray, is_real
 from autotune.errors import InputError
 from autotune.text_files import checked_path, printable, read_toml
 from autotune.whole_files import append_whole, write_whole
@@ -230,6 +230,29 @@ class Recording:
         return replace(self, t=earliest(b) + b * mean * number)
 
     @checked
+    def standing_still(self, rows: BoolArray, columns: Sequence[str] = ("u",)) -> Recording:
+        """Return the recording with commands that stand still, at their mean, through each run of some rows.
+
+        Parameters
+        ----------
+        rows : (N,) bool array
+            The rows.
+        columns : sequence of str
+            The commands.
+
+        Returns
+        -------
+        Recording
+            Itself where no command moves in such a run.
+        """
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], rows, [False]]).astype(np.int8))).reshape(-1, 2)
+        still = {name: self[name].copy() for name in columns}
+        moving = [(x, a, b) for x in still.values() for a, b in edges if np.ptp(x[a:b]) > 0.0]
+        for x, a, b in moving:
+            x[a:b] = x[a:b].mean()
+        u = still.pop("u", self.u)
+        return replace(self, u=u, extra=MappingProxyType({**self.extra, **still})) if moving else self
+
     def require_finite(self, columns: Iterable[str] = ("u", "y")) -> Recording:
         """Return self if the columns hold no NaN or infinity.
 

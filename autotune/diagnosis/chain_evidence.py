@@ -13,15 +13,16 @@ import numpy as np
 from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.adequacy import residual_tests
 from autotune.diagnosis.evidence.description import Description, describe
-from autotune.diagnosis.evidence.held_out import FitQuality, held_out_error
+from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.misread import misread_columns
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.evidence.own_noise import OwnNoise
 from autotune.diagnosis.extended import extended_model, with_uncertainty
-from autotune.diagnosis.fitting.retuning import prepare, under_noise
+from autotune.diagnosis.fitting.retuning import under_noise
 from autotune.diagnosis.readable import in_commands, readable
 from autotune.diagnosis.result import FoundEffect, OperatingRange, Verdict
 from autotune.diagnosis.safe_extension import safe_extension
+from autotune.diagnosis.selection.chain_proposals import search_chain
 from autotune.diagnosis.selection.hypothesis import contradicted_effects
 from autotune.diagnosis.selection.judged_chain import JudgedChain, as_search, at_both_scales, quality, varies_more
 from autotune.diagnosis.selection.probability import probability_of
@@ -30,7 +31,7 @@ from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.simulation.forecast import forecast
 from autotune.diagnosis.verdict import OFFSET, Evidence
-from autotune.effects import STRUCTURES, kind_of
+from autotune.effects import KINDS, STRUCTURES, kind_of
 from autotune.models import Effect, Model, Parameter
 from autotune.recording import Recording
 
@@ -182,11 +183,11 @@ class ChainEvidence(Evidence):
     def misread_columns(self) -> str:
         """Say what is wrong with the columns, where the model then explains the recordings."""
 
-        def error_of(changed: Sequence[Recording], good: Sequence[BoolArray]) -> float:
-            data, retuned = prepare(self.model, changed, good, self.limits)
-            return held_out_error(retuned, data, tune=True)
+        def retuned(changed: Sequence[Recording], good: Sequence[BoolArray]) -> tuple[float, bool]:
+            found = search_chain(self.model, changed, good, KINDS, limits=self.limits)
+            return found.retuned.error, found.judged[0].heeds_commands
 
-        return misread_columns(self.measured, self.model.input.offset, self.quality, self.limits, error_of)
+        return misread_columns(self.measured, self.model.input.offset, self.quality, self.limits, retuned)
 
     @property
     def measured(self) -> tuple[Recording, ...]:

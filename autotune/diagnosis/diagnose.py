@@ -95,28 +95,31 @@ def diagnose(
         return _diagnosis(evidence.keeping(()), said=whole)
     parts = parts_of(recordings, LEAST_ROWS)
     said = agreement(whole, begins, parts, _on_parts(evidence, progress), least=0.0)
-    return _diagnosis(evidence.keeping(likely(said)), said=said, kept=likely(said))
+    evidence = evidence.keeping(likely(said))
+    if judged(evidence) == "effect" and (unheeded := evidence.unheeded_commands()):
+        return _diagnosis(evidence.keeping(()), unheeded)
+    return _diagnosis(evidence, said=said, kept=likely(said))
 
 
 def _diagnosis(
-    evidence: Evidence, columns: str = "", said: Mapping[str, float] = MappingProxyType({}), kept: Collection[str] = ()
+    evidence: Evidence, instead: str = "", said: Mapping[str, float] = MappingProxyType({}), kept: Collection[str] = ()
 ) -> Diagnosis:
-    """Return what evidence says; where columns are misread no physics is said to be missing."""
-    verdict = "unexplained" if columns else judged(evidence)
+    """Return what evidence says; where a sentence is said instead no physics is said to be missing."""
+    verdict = "unexplained" if instead else judged(evidence)
     named = [e for e in found_effects(evidence, verdict) if e.name in kept]
     effects = tuple(replace(e, probability=said[e.name]) for e in named)
-    description = evidence.description() if verdict == "unexplained" and not columns else None
-    places = () if columns else places_of(evidence, effects, description)
-    handed_out, wanted = evidence.handed_out("none" if columns else verdict)
+    description = evidence.description() if verdict == "unexplained" and not instead else None
+    places = () if instead else places_of(evidence, effects, description)
+    handed_out, wanted = evidence.handed_out("none" if instead else verdict)
     withheld = ""
     if handed_out is not wanted and verdict != "unexplained":
         withheld = WITHHELD[handed_out is evidence.model]
-    first, *rest = (columns,) if columns else sentences_of(verdict, effects, evidence, places, said)
-    unsaid = evidence.unsaid if verdict in ("effect", "unexplained") and not columns else ""
+    first, *rest = (instead,) if instead else sentences_of(verdict, effects, evidence, places, said)
+    unsaid = evidence.unsaid if verdict in ("effect", "unexplained") and not instead else ""
     return Diagnosis(
         verdict=verdict,
         effects=effects,
-        candidates=() if columns else consistent(evidence.candidates, said, evidence.names),
+        candidates=() if instead else consistent(evidence.candidates, said, evidence.names),
         places=places,
         fit=evidence.quality,
         extended_model=handed_out,

@@ -17,7 +17,7 @@ from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.operating_point import Offset
 from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.result import FoundEffect, SearchResult, Verdict
-from autotune.diagnosis.selection.judged import of_likely, probabilities
+from autotune.diagnosis.selection.judged import Judged, of_likely, probabilities, rank
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.thresholds import Thresholds
@@ -32,6 +32,12 @@ if TYPE_CHECKING:
 
 #: Held-out error, as a share of the spread of y, from which on a simulation follows nothing: 1 is y's mean.
 ASTRAY = 0.9
+#: What is said where effects were found that follow y whatever the command does, as a slow lag follows any walk.
+UNHEEDED = (
+    "Nothing is said of what is missing: on rows that were left out, what explains y best errs as much with commands "
+    "that stand still there. Look whether the columns are u and y of this model, and record again with commands that "
+    "move y."
+)
 #: The effect that every fit of a chain has as a free number.
 OFFSET = "actuator.offset"
 
@@ -158,6 +164,13 @@ class Evidence(ABC):
     @abstractmethod
     def misread_columns(self) -> str:
         """Say what is wrong with the columns, where the model then explains the recordings; else nothing."""
+
+    def unheeded_commands(self) -> str:
+        """Say that what explains y best follows no command, where an offset or effects were found; else nothing."""
+        if self.found is None or not (self.names or self.offset):
+            return ""
+        best: Judged = rank(self.found.judged)[0]
+        return "" if best.heeds_commands else UNHEEDED
 
     @abstractmethod
     def handed_out(self, verdict: Verdict) -> tuple[AnyModel, AnyModel]:

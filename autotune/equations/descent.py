@@ -26,7 +26,7 @@ from autotune.equations.sensitivity import (
     sensitivities,
     side_by_side,
 )
-from autotune.equations.simulate import Compiled, Run
+from autotune.equations.simulate import Compiled, Drive, Run
 from autotune.equations.starts import given_starts, started_anew, state_scales
 from autotune.errors import InputError
 
@@ -125,10 +125,11 @@ class Descent:
             for one in self._data
         ]  # fmt: skip
 
-    def simulated(self) -> list[FloatArray]:
-        """Return y at every row of every recording; NaN from where a simulation runs away."""
+    def simulated(self, drives: Sequence[Drive] | None = None) -> list[FloatArray]:
+        """Return y at every row of every recording, of other drives if given; NaN from where a simulation runs away."""
         p = values_of(self._compiled, self._z)
-        return [run_windows(self._compiled, p, one.drive, one.windows).y for one in self._data]
+        each = zip(self._data, drives or [one.drive for one in self._data], strict=True)
+        return [run_windows(self._compiled, p, drive, one.windows).y for one, drive in each]
 
     def _projected(self, one: FitData, s: Sensitivities, per_z: FloatArray) -> _Derivatives:
         J = (s.to_parameters * per_z)[:, self._which]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from autotune.arrays import FloatArray, IntArray
 from autotune.equations.descent import Descent
 from autotune.equations.fit_data import Fitted, data_of
+from autotune.equations.simulate import drive_of
 from autotune.recording import Recording
 
 
@@ -35,16 +37,52 @@ def left_out_squares(fitted: Fitted, recordings: Sequence[Recording], labels: Se
     Numbers and start states move by one Gauss-Newton step with the derivatives of the fit to all rows: first order, so
     that a stretch on which alone a threshold was felt is judged a little too well.
     """
+    squares = np.zeros(1 + max(int(label.max(initial=-1)) for label in labels))
+    for k, there in _left_out(fitted, recordings, labels, squares.size):
+        squares[k] = _squares(there.simulated(), recordings, labels, k)
+    return squares
+
+
+def error_beside_still(fitted: Fitted, recordings: Sequence[Recording], labels: Sequence[IntArray]) -> float | None:
+    """Return the error on left-out stretches as a share of what it is with inputs that stand still there.
+
+    Parameters
+    ----------
+    fitted, recordings, labels
+        As in :func:`left_out_squares`.
+
+    Returns
+    -------
+    float or None
+        Of the stretches in which an input moves, from a state that the rows before them tell; None where none does.
+    """
+    own = still = 0.0
+    model, count = fitted.compiled.model, 1 + max(int(label.max(initial=-1)) for label in labels)
+    for k, there in _left_out(fitted, recordings, labels, count):
+        driving = [r.standing_still(label == k, model.columns) for r, label in zip(recordings, labels, strict=True)]
+        if any(one is not r for one, r in zip(driving, recordings, strict=True)):
+            own += _squares(there.simulated(), recordings, labels, k)
+            still += _squares(there.simulated([drive_of(model, r) for r in driving]), recordings, labels, k)
+    return math.sqrt(own / still) if still > 0.0 else None
+
+
+def _squares(runs: Sequence[FloatArray], recordings: Sequence[Recording], labels: Sequence[IntArray], k: int) -> float:
+    """Return a stretch's sum of squared errors; infinite where a simulation runs away."""
+    outs = [np.isfinite(r.y) & (label == k) for r, label in zip(recordings, labels, strict=True)]
+    e = np.concatenate([(r.y - y)[out] for r, y, out in zip(recordings, runs, outs, strict=True)])
+    return float(e @ e) if np.all(np.isfinite(e)) else math.inf
+
+
+def _left_out(
+    fitted: Fitted, recordings: Sequence[Recording], labels: Sequence[IntArray], count: int
+) -> Iterator[tuple[int, Descent]]:
+    """Yield each stretch's number and a fit that has moved to what the other rows say."""
     compiled = fitted.compiled
     whole = [data_of(compiled, r, fitted.parameters, None, w) for r, w in zip(recordings, fitted.windows, strict=True)]
     which = np.flatnonzero([p.spread > 0.0 for p in compiled.parameters])
     known = Descent(compiled, whole, which, fitted.z).sensitivities()
-    squares = np.zeros(1 + max(int(label.max(initial=-1)) for label in labels))
-    for k in range(squares.size):
+    for k in range(count):
         kept = [replace(one, good=one.good & (label != k)) for one, label in zip(whole, labels, strict=True)]
         there = Descent(compiled, kept, which, fitted.z, known)
         there.step(most=1)
-        for one, label, y in zip(whole, labels, there.simulated(), strict=True):
-            out = one.good & (label == k)
-            squares[k] += float(np.sum((one.y - y)[out] ** 2)) if np.all(np.isfinite(y[out])) else np.inf
-    return squares
+        yield k, there

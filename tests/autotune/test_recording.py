@@ -113,3 +113,15 @@ def test_a_recording_is_never_overwritten_by_an_experiment(tmp_path: Path) -> No
         writer.append([0.0, 1.0, 2.0])
     with pytest.raises(InputError, match="already there"):
         RecordingWriter(path, ["t", "u", "y"])
+
+
+@given(arrays(float, 40, elements=finite), arrays(bool, 40))
+def test_commands_stand_still_at_their_mean_in_the_rows_that_are_asked_for(u: np.ndarray, rows: np.ndarray) -> None:
+    r = Recording(t=np.arange(40.0), u=u, y=np.zeros(40))
+    still = r.standing_still(rows)
+    np.testing.assert_array_equal(still.u[~rows], u[~rows])
+    edges = np.flatnonzero(np.diff(rows)) + 1
+    for part, asked in zip(np.split(np.arange(40), edges), np.split(rows, edges), strict=True):
+        if asked.all():
+            np.testing.assert_allclose(still.u[part], u[part].mean(), atol=1e-9 * np.abs(u).max())
+    assert (still is r) == np.array_equal(still.u, u)

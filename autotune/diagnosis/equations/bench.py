@@ -122,6 +122,10 @@ class Bench(ABC):
     def left_out_squares(self, outcome: Outcome) -> FloatArray:
         """Return squared errors on stretches, the numbers fitted to the other ones."""
 
+    @abstractmethod
+    def error_beside_still(self, outcome: Outcome) -> float | None:
+        """Return the error there as a share of what it is with inputs that stand still; None where none moves."""
+
     def _start(self, compiled: Compiled, start: Outcome | None) -> FloatArray:
         """Return where a fit begins: the model's own numbers where another fit ended, if any, the others nominal."""
         z = np.zeros(len(compiled.parameters))

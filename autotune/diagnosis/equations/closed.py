@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from autotune.equations.black_box import BlackBox, driven, read_out
 from autotune.equations.effects import apply, at_reading, compile_with, with_values
 from autotune.equations.fit_data import Fitted
 from autotune.equations.parameter_scales import slopes_of, values_of
-from autotune.equations.simulate import Compiled
+from autotune.equations.simulate import Compiled, Drive, drive_of
 from autotune.errors import InputError
 from autotune.models import Effect
 from autotune.recording import Recording
@@ -61,8 +62,10 @@ class ClosedBench(Bench):
                        for p in compiled.parameters)  # fmt: skip
         return replace(compiled, parameters=(*self._box.parameters, *inside))
 
-    def _simulated(self, compiled: Compiled, effects: Sequence[Effect], z: FloatArray) -> list[FloatArray]:
-        """Return y at every row of every recording."""
+    def _simulated(
+        self, compiled: Compiled, effects: Sequence[Effect], z: FloatArray, drives: Sequence[Drive] | None = None
+    ) -> list[FloatArray]:
+        """Return y at every row of every recording, of other drives if given."""
         p = values_of(compiled, z)
         values = {q.name: (float(v), 0.0) for q, v in zip(compiled.parameters, p, strict=True)}
         now = with_values(effects, values)
@@ -70,7 +73,7 @@ class ClosedBench(Bench):
         at_input = [e for e in applied.extensions if e.output is None]
         own = {q.name: values[q.name][0] for q in self._box.parameters}
         found = []
-        for drive in self._drives:
+        for drive in drives or self._drives:
             arriving = driven(self._box, at_input, applied.delays, applied.before(drive))
             y = self._box.simulation(own, arriving)
             found.append(applied.after(read_out(y, drive, at_reading(self.model, now))))
@@ -176,15 +179,31 @@ class ClosedBench(Bench):
 
     def left_out_squares(self, outcome: Outcome) -> FloatArray:
         """Return squared errors on stretches, the numbers fitted to the other ones."""
+        squares = []
+        for out, there in self._left_out(outcome):
+            squares.append(_squares(there.fitted.residuals, out))
+        return np.array(squares)
+
+    def error_beside_still(self, outcome: Outcome) -> float | None:
+        """Return the error there as a share of what it is with inputs that stand still; None where none moves."""
+        own = still = 0.0
+        for out, there in self._left_out(outcome):
+            pairs = zip(self.recordings, out, strict=True)
+            driving = [r.standing_still(rows, self.model.columns) for r, rows in pairs]
+            if any(one is not r for one, r in zip(driving, self.recordings, strict=True)):
+                drives = [drive_of(self.model, r) for r in driving]
+                runs = self._simulated(there.fitted.compiled, outcome.effects, there.fitted.z, drives)
+                own += _squares(there.fitted.residuals, out)
+                still += _squares([r.y - y for r, y in zip(self.recordings, runs, strict=True)], out)
+        return math.sqrt(own / still) if still > 0.0 else None
+
+    def _left_out(self, outcome: Outcome) -> Iterator[tuple[list[BoolArray], Outcome]]:
+        """Yield the rows of each stretch, a mask per recording, and a fit moved to what the other rows say."""
         rows = [len(r) for r in self.recordings]
         labels = stretches_in(rows, [np.zeros(1, np.int64) for _ in rows], [np.array([n]) for n in rows])
-        squares = np.zeros(1 + max(int(label.max(initial=-1)) for label in labels))
-        for k in range(squares.size):
+        for k in range(1 + max(int(label.max(initial=-1)) for label in labels)):
             kept = [ok & (label != k) for ok, label in zip(self._rows, labels, strict=True)]
-            there = self._fit(outcome.effects, outcome, 1, kept)
-            for e, label in zip(there.fitted.residuals, labels, strict=True):
-                squares[k] += float(np.nansum(e[label == k] ** 2))
-        return squares
+            yield [label == k for label in labels], self._fit(outcome.effects, outcome, 1, kept)
 
     def held_out_error(self, outcome: Outcome, refits: bool) -> float:
         """Return the rms error on the last third of every recording, the numbers fitted to the rest."""
@@ -194,3 +213,8 @@ class ClosedBench(Bench):
             outcome = self._fit(outcome.effects, outcome, 6, first)
         e = np.concatenate([r[k:] for r, k in zip(outcome.fitted.residuals, cut, strict=True)])
         return float(np.sqrt(np.nanmean(e**2)))
+
+
+def _squares(residuals: Sequence[FloatArray], out: Sequence[BoolArray]) -> float:
+    """Return the sum of squared residuals in some rows, those that are no numbers not counting."""
+    return float(sum(np.nansum(e[rows] ** 2) for e, rows in zip(residuals, out, strict=True)))

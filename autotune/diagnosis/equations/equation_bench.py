@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from autotune.arrays import BoolArray, FloatArray
+from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import Signals, Trial, form_of
 from autotune.diagnosis.equations.first_order import explained, start_bases, without_starts
@@ -26,7 +26,7 @@ from autotune.effects.in_equations import Scales
 from autotune.equations.effects import compile_with, where_of
 from autotune.equations.fit import LEAST_ROWS, fit, retune
 from autotune.equations.fit_data import Fitted
-from autotune.equations.left_out import left_out_squares
+from autotune.equations.left_out import error_beside_still, left_out_squares
 from autotune.equations.linearise import growth_rate
 from autotune.equations.model import EquationModel, InputColumn
 from autotune.equations.parameter_scales import values_of
@@ -149,10 +149,15 @@ class EquationBench(Bench):
 
     def left_out_squares(self, outcome: Outcome) -> FloatArray:
         """Return squared errors on stretches, the numbers fitted to the other ones."""
+        return left_out_squares(outcome.fitted, self.recordings, self._stretches(outcome))
+
+    def error_beside_still(self, outcome: Outcome) -> float | None:
+        """Return the error there as a share of what it is with inputs that stand still; None where none moves."""
+        return error_beside_still(outcome.fitted, self.recordings, self._stretches(outcome))
+
+    def _stretches(self, outcome: Outcome) -> list[IntArray]:
         windows = outcome.fitted.windows
-        rows = [len(r) for r in self.recordings]
-        labels = stretches_in(rows, [w.starts for w in windows], [w.stops for w in windows])
-        return left_out_squares(outcome.fitted, self.recordings, labels)
+        return stretches_in([len(r) for r in self.recordings], [w.starts for w in windows], [w.stops for w in windows])
 
     def _compiled(self, effects: Sequence[Effect]) -> Compiled:
         compiled, own = compile_with(self.model, effects), self._own

@@ -12,7 +12,7 @@ from autotune.arrays import BoolArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.closed import ClosedBench
 from autotune.diagnosis.equations.equation_bench import EquationBench
-from autotune.diagnosis.equations.judged import JudgedEquations
+from autotune.diagnosis.equations.judged import JudgedEquations, judge
 from autotune.diagnosis.equations.scores import slow_power, variance_ratio
 from autotune.diagnosis.equations.shown import EquationSearch
 from autotune.diagnosis.equations.sizes import command_of, spans_at, with_units
@@ -112,11 +112,12 @@ class EquationEvidence(Evidence):
         if self.model.columns[0] != "u":
             return ""
 
-        def error_of(changed: Sequence[Recording], good: Sequence[BoolArray]) -> float:
+        def retuned(changed: Sequence[Recording], good: Sequence[BoolArray]) -> tuple[float, bool]:
             bench = bench_of(self.model, changed, good, self.limits)
-            return bench.held_out_error(bench.retuned(), True) / bench.spread
+            one = judge(bench, bench.retuned(), len(self.model.effects))
+            return (math.inf, False) if one is None else (one.error, one.heeds_commands)
 
-        return misread_columns(self.given, self.model.inputs[0].offset, self.quality, self.limits, error_of)
+        return misread_columns(self.given, self.model.inputs[0].offset, self.quality, self.limits, retuned)
 
     def handed_out(self, verdict: Verdict) -> tuple[EquationModel | BlackBox, EquationModel | BlackBox]:
         """Return the model to go on with, and the one that was wanted."""

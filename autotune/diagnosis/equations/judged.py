@@ -85,6 +85,12 @@ class JudgedEquations(Judged):
         return self.outcome.count
 
     @cached_property
+    def beside_still(self) -> tuple[float, ...]:
+        """Errors on left-out stretches as shares of those with commands that stand still; none if none moves."""
+        share = self.bench.error_beside_still(self.outcome)
+        return () if share is None else (share,)
+
+    @cached_property
     def error(self) -> float:
         """Error on the last third of every recording, its numbers fitted to the rest, as a share of the spread of y."""
         return self.bench.held_out_error(self.outcome, self.tuned) / self.bench.spread

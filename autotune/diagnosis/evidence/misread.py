@@ -18,7 +18,7 @@ def misread_columns(
     centre: float,
     quality: FitQuality,
     limits: Thresholds,
-    error_of: Callable[[Sequence[Recording], Sequence[BoolArray]], float],
+    retuned: Callable[[Sequence[Recording], Sequence[BoolArray]], tuple[float, bool]],
 ) -> str:
     """Say what is wrong with the columns, where a model without further physics then explains the recordings.
 
@@ -32,9 +32,9 @@ def misread_columns(
         Errors of the model with the recordings as they are.
     limits : Thresholds
         What decides.
-    error_of : callable
+    retuned : callable
         Returns the held-out error of the model, retuned to other recordings of whose rows some count, as a share of the
-        spread of y.
+        spread of y, and whether it errs more with commands that stand still.
 
     Returns
     -------
@@ -45,7 +45,7 @@ def misread_columns(
     -----
     It is asked only where the retuned model explains less than half of what y does, and it is said only where the
     other reading leaves less than half of that variance, and no more than effects do: an effect costs numbers, a
-    reversed sign none.
+    reversed sign none. Columns of noise are no better read otherwise: the model then follows the command, too.
     """
     if 2.0 * quality.retuned**2 < 1.0:
         return ""
@@ -58,10 +58,11 @@ def misread_columns(
             good, _ = inspect(changed, (), limits)
             if not all(ok.any() for ok in good):  # a command that never moves is no reading
                 continue
-            error = error_of(changed, good)
+            error, heeds = retuned(changed, good)
         except RUNAWAY:
             continue
-        if 2.0 * error**2 < min(1.0, quality.retuned**2) and error < (1.0 + limits.material) * quality.extended:
+        explains = 2.0 * error**2 < min(1.0, quality.retuned**2)
+        if heeds and explains and error < (1.0 + limits.material) * quality.extended:
             return (
                 f"First of all, {what}: so read, the retuned simulation errs by {error:.3g} of the spread of y on rows "
                 f"that were left out, as they are by {quality.retuned:.3g}."

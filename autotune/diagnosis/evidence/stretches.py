@@ -8,7 +8,7 @@ one, and the free run through that one is judged. Two models are compared stretc
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -81,6 +81,40 @@ def held_out_squares(result: Fit, data: Data) -> FloatArray:
     window's first rows say of its start state is always known. With thresholds that is first order: a stretch on which
     a threshold alone was felt is judged a little too well.
     """
+    squares = np.full(STRETCHES, math.inf)
+    for k, out, there, _ in _left_out(result, data):
+        squares[k] = float(there.e[out] @ there.e[out])
+    return squares * data.noise.sd**2
+
+
+def error_beside_still(result: Fit, data: Data) -> float | None:
+    """Return the error on left-out stretches as a share of what it is with commands that stand still there.
+
+    Parameters
+    ----------
+    result, data
+        As in :func:`held_out_squares`.
+
+    Returns
+    -------
+    float or None
+        Of the stretches in which a command moves, from a state that the rows before them tell; None where none does.
+    """
+    own = still = 0.0
+    labels = stretches_of(data)
+    for k, out, there, problem in _left_out(result, data):
+        pairs = enumerate(zip(data.driving, labels, strict=True))
+        driving = [r.standing_still(data.in_driving(i, label == k)) for i, (r, label) in pairs]
+        if all(one is r for one, r in zip(driving, data.driving, strict=True)):
+            continue
+        beside = try_point(Problem(problem.parametrisation, data.driven_by(driving)), there.theta, there.x0)
+        own += float(there.e[out] @ there.e[out])
+        still += math.inf if beside is None else float(beside.e[out] @ beside.e[out])
+    return math.sqrt(own / still) if still > 0.0 else None
+
+
+def _left_out(result: Fit, data: Data) -> Iterator[tuple[int, BoolArray, Iterate, Problem]]:
+    """Yield each stretch's number and rows, and where a fit to the others goes, unless it runs away."""
     labels = np.concatenate(stretches_of(data))
     problem = Problem(result.parametrisation, data)
     problem.scales = result.sim.state_sizes(
@@ -88,12 +122,11 @@ def held_out_squares(result: Fit, data: Data) -> FloatArray:
     )
     start = problem.iterate(result.theta, [x.copy() for x in result.x0])
     J, Jx = result.jacobian[0], problem.jacobian(start, np.zeros(result.theta.size, dtype=bool))[1]
-    squares = np.zeros(STRETCHES)
     for k in range(STRETCHES):
         out = labels == k
         there = _without(problem, start, (J, Jx), out)
-        squares[k] = float(there.e[out] @ there.e[out]) if there is not None else math.inf
-    return squares * data.noise.sd**2
+        if there is not None:
+            yield k, out, there, problem
 
 
 def _without(

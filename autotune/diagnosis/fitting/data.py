@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -132,6 +132,20 @@ class Data:
     def driving(self) -> tuple[Recording, ...]:
         """The recordings with all their rows, whose commands drive simulations."""
         return self.recordings if self.whole is None else self.whole.recordings
+
+    def driven_by(self, driving: Sequence[Recording]) -> Data:
+        """Return the data with other recordings that drive simulations, as long as those that do."""
+        if self.whole is None:
+            return replace(self, recordings=tuple(driving))
+        return replace(self, whole=replace(self.whole, recordings=tuple(driving)))
+
+    def in_driving(self, number: int, rows: BoolArray) -> BoolArray:
+        """Return rows of a recording, a mask, as a mask of the recording with all its rows."""
+        if self.whole is None:
+            return rows
+        mask = np.zeros(len(self.driving[number]), dtype=bool)
+        mask[self.kept[number]] = rows
+        return mask
 
     @cached_property
     def first_rows(self) -> tuple[IntArray, ...]:

@@ -72,6 +72,21 @@ class Judged(ABC):
 
     @property
     @abstractmethod
+    def beside_still(self) -> tuple[float, ...]:
+        """Errors on left-out stretches as shares of those with commands that stand still; none if none moves."""
+
+    @property
+    def heeds_commands(self) -> bool:
+        """Whether commands that stand still in the stretches that were left out make it err by a tenth more there.
+
+        A slow lag follows any walk from where a stretch begins, whatever the command does. At one of the scales is
+        enough: in short windows slow plants hardly move, and in long ones those that integrate err by what piles up.
+        """
+        shares = self.beside_still
+        return not shares or min(shares) < 1.0 - self.limits.material
+
+    @property
+    @abstractmethod
     def added(self) -> tuple[Effect, ...]:
         """Its effects with their fitted values."""
 

@@ -12,7 +12,7 @@ import numpy as np
 from autotune.diagnosis.evidence.adequacy import is_noise
 from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.held_out import FitQuality
-from autotune.diagnosis.evidence.stretches import judged_rows, rms
+from autotune.diagnosis.evidence.stretches import error_beside_still, judged_rows, rms
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, fit_from, residual_at
 from autotune.diagnosis.fitting.long_windows import spread_of
@@ -53,6 +53,13 @@ class JudgedChain(Judged):
     def rows(self) -> int:
         """Rows that it was fitted to."""
         return self.fit.rows
+
+    @cached_property
+    def beside_still(self) -> tuple[float, ...]:
+        """Errors on left-out stretches as shares of those with commands that stand still; none if none moves."""
+        both = ((self.fit, self.data), (self.short, self.few))[: 1 if self.few is self.data else 2]
+        shares = [error_beside_still(*one) for one in both]
+        return tuple(share for share in shares if share is not None)
 
     @property
     def added(self) -> tuple[Effect, ...]:
