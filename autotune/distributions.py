@@ -15,22 +15,54 @@ Values = TypeVar("Values", float, FloatArray)
 
 
 def chi2_quantile(probability: float, freedom: float) -> float:
-    """Return the value below which chi-square with so many degrees of freedom lies with a probability."""
+    """Return the value below which chi-square lies with a probability.
+
+    Parameters
+    ----------
+    probability : float
+        0 to 1.
+    freedom : float
+        Degrees of freedom.
+    """
     return float(chdtri(freedom, 1.0 - probability))
 
 
 def chi2_tail(value: float, freedom: float) -> float:
-    """Return the probability that chi-square with so many degrees of freedom exceeds a value."""
+    """Return the probability that chi-square exceeds a value.
+
+    Parameters
+    ----------
+    value : float
+        At least 0.
+    freedom : float
+        Degrees of freedom.
+    """
     return float(chdtrc(freedom, value))
 
 
 def f_quantile(probability: float, above: float, below: float) -> float:
-    """Return the value below which F lies with a probability, by the freedom of its two mean squares."""
+    """Return the value below which the ratio F of two mean squares lies with a probability.
+
+    Parameters
+    ----------
+    probability : float
+        0 to 1.
+    above, below : float
+        Degrees of freedom of the numerator and of the denominator.
+    """
     return float(fdtri(above, below, probability))
 
 
 def f_tail(value: float, above: float, below: float) -> float:
-    """Return the probability that F exceeds a value, by the freedom of its two mean squares."""
+    """Return the probability that the ratio F of two mean squares exceeds a value.
+
+    Parameters
+    ----------
+    value : float
+        At least 0.
+    above, below : float
+        Degrees of freedom of the numerator and of the denominator.
+    """
     return float(fdtrc(above, below, value))
 
 
@@ -50,5 +82,18 @@ def log_normal_tail(value: Values) -> Values:
 
 
 def student_quantile(probability: float, freedom: Values) -> Values:
-    """Return the value below which Student's t lies with a probability, for each number of degrees of freedom."""
+    """Return the value below which Student's t lies with a probability.
+
+    Parameters
+    ----------
+    probability : float
+        0 to 1.
+    freedom : float or (N,) array
+        Degrees of freedom.
+
+    Returns
+    -------
+    float or (N,) array
+        One for each number of degrees of freedom.
+    """
     return stdtrit(freedom, probability)  # type: ignore[return-value]  # of the stubs: half precision too

@@ -152,7 +152,15 @@ def _respond(
 
 @njit(cache=True)
 def respond_sampled(num: FloatArray, den: FloatArray, u: FloatArray) -> FloatArray:
-    """Return the output (N,) of a difference equation from rest, as :func:`sampled` gives it, to commands (N,)."""
+    """Return the output (N,) of a difference equation from rest, as :func:`sampled` gives it, to commands (N,).
+
+    Parameters
+    ----------
+    num, den : (M,) and (K,) arrays
+        Coefficients of powers of the delay of one row, the constant first.
+    u : (N,) array
+        Input.
+    """
     y = np.zeros(u.size)
     for k in range(u.size):
         y[k] = _next_output(num, den, u, y, k)

@@ -140,7 +140,15 @@ class Data:
         return replace(self, whole=replace(self.whole, recordings=tuple(driving)))
 
     def in_driving(self, number: int, rows: BoolArray) -> BoolArray:
-        """Return rows of a recording, a mask, as a mask of the recording with all its rows."""
+        """Return rows of a recording as rows of it with all of them.
+
+        Parameters
+        ----------
+        number : int
+            Position of the recording.
+        rows : (N,) bool array
+            A mask of the rows that are here.
+        """
         if self.whole is None:
             return rows
         mask = np.zeros(len(self.driving[number]), dtype=bool)
