@@ -253,6 +253,7 @@ class Recording:
         u = still.pop("u", self.u)
         return replace(self, u=u, extra=MappingProxyType({**self.extra, **still})) if moving else self
 
+    @checked
     def require_finite(self, columns: Iterable[str] = ("u", "y")) -> Recording:
         """Return self if the columns hold no NaN or infinity.
 

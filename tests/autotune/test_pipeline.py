@@ -222,7 +222,7 @@ def test_a_load_in_the_midst_of_the_verification_fails_the_run_and_is_found_in_i
 ) -> None:
     config, rig = loaded
     store_config(config, tmp_path)
-    monkeypatch.setattr("autotune.cli.run.rig_of", lambda _: rig)
+    monkeypatch.setattr("autotune.cli.run.rig_of", lambda config, **_: rig)
     done = CliRunner().invoke(app, ["run", str(tmp_path / "config.toml"), "--out", str(tmp_path / "out")])
     assert done.exit_code == 3, done.output
     assert "Not accepted" in done.output

@@ -114,8 +114,12 @@ class EquationEvidence(Evidence):
 
         def retuned(changed: Sequence[Recording], good: Sequence[BoolArray]) -> tuple[float, bool]:
             bench = bench_of(self.model, changed, good, self.limits)
-            one = judge(bench, bench.retuned(), len(self.model.effects))
-            return (math.inf, False) if one is None else (one.error, one.heeds_commands)
+            outcome = bench.retuned()
+            error = bench.held_out_error(outcome, True) / bench.spread
+            if error >= 1.0:  # no reading: a closed model may overflow where stretches are left out of it
+                return error, False
+            one = judge(bench, outcome, len(self.model.effects))
+            return error, one is not None and one.heeds_commands
 
         return misread_columns(self.given, self.model.inputs[0].offset, self.quality, self.limits, retuned)
 

@@ -16,6 +16,7 @@ class Astray(Judged):
     leaves_noise = False
     limits: Thresholds = IN_USE
     variance, rows, numbers, error, added = math.nan, 0, 0, 1.0, ()
+    beside_still = ()
 
     def unfelt(self, effects: Sequence[Effect]) -> frozenset[str]:
         """Return none: every effect would be felt."""
