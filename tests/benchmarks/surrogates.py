@@ -31,6 +31,12 @@ _PROBABLE = 0.5
 #: Chi-square of a point's two values, beyond which the truth is by chance once in a thousand.
 _SURE = 13.8
 
+#: What a diagnosis takes the plant for.
+NOMINAL = Model(
+    name="nominal", input=Port(unit="", offset=5.0), output=Port(unit="", offset=50.0),
+    blocks=(Block(name="plant", place="plant", dynamics=TransferFunction(num=(2.0,), den=(9.5, 1.0), delay_s=3.0)),),
+)  # fmt: skip
+
 
 def _commands(rng: np.random.Generator, rows: int) -> FloatArray:
     return np.repeat(rng.choice([4.5, 5.5], rows // 20 + 1), 20)[:rows]
@@ -187,9 +193,7 @@ def _routine(recording: Recording, true: TransferFunction | None) -> bool:
 def _diagnose(recording: Recording, true: TransferFunction | None) -> bool:
     from autotune.diagnosis.diagnose import diagnose
 
-    lag = Block(name="plant", place="plant", dynamics=TransferFunction(num=(2.0,), den=(9.5, 1.0), delay_s=3.0))
-    nominal = Model(name="nominal", blocks=(lag,), input=Port(unit="", offset=5.0), output=Port(unit="", offset=50.0))
-    found = diagnose(nominal, [recording])
+    found = diagnose(NOMINAL, [recording])
     of_columns = found.sentences[0].startswith("First of all") and not recording.name.startswith(_MISREAD)
     return of_columns or any(effect.probability >= _PROBABLE for effect in found.effects)
 

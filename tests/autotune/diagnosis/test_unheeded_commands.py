@@ -16,7 +16,7 @@ from autotune.equations.black_box import from_function
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
 from tests.autotune.equations.models import one_state
-from tests.benchmarks.surrogates import surrogate
+from tests.benchmarks.surrogates import NOMINAL, surrogate
 
 ROWS, DT, SLOW_S = 800, 0.1, 50.0
 COMMANDS = np.repeat(np.random.default_rng(1).uniform(-1.0, 1.0, ROWS // 20), 20)
@@ -72,22 +72,14 @@ class TestStretchesWithCommandsThatStandStill:
 
 @pytest.mark.parametrize("seed", [3, 6, 15])
 def test_nothing_is_said_of_two_walks(seed: int) -> None:
-    model = Model(
-        name="nominal", input=Port(unit="", offset=5.0), output=Port(unit="", offset=50.0),
-        blocks=(Block(name="p", place="plant", dynamics=TransferFunction(num=(2.0,), den=(9.5, 1.0), delay_s=3.0)),),
-    )  # fmt: skip
-    result = diagnose(model, [surrogate("random walk", seed)])
+    result = diagnose(NOMINAL, [surrogate("random walk", seed)])
     assert (result.verdict, result.effects, result.candidates) == ("unexplained", (), ())
     assert result.sentences[0].startswith("Nothing is said of what is missing")
-    assert (result.extended_model.blocks, result.extended_model.effects) == (model.blocks, ())
+    assert (result.extended_model.blocks, result.extended_model.effects) == (NOMINAL.blocks, ())
 
 
 def test_a_sign_is_reversed_though_an_effect_explains_as_much() -> None:
     """Both are judged on the same stretches: an error on half the windows is larger than on an eighth of the rows."""
-    model = Model(
-        name="nominal", input=Port(unit="", offset=5.0), output=Port(unit="", offset=50.0),
-        blocks=(Block(name="p", place="plant", dynamics=TransferFunction(num=(2.0,), den=(9.5, 1.0), delay_s=3.0)),),
-    )  # fmt: skip
-    result = diagnose(model, [surrogate("wrong sign", 9)])
+    result = diagnose(NOMINAL, [surrogate("wrong sign", 9)])
     assert "the sign of u" in result.sentences[0]
     assert not result.effects
