@@ -84,7 +84,7 @@ def _warn_beyond(model: Model, recording: Recording, y_sim: FloatArray) -> None:
 @app.command()
 def diagnose(
     recordings: Annotated[
-        list[Path], typer.Argument(help="recordings, best with different excitation", metavar="REC.csv...")
+        list[Path], typer.Argument(help="recordings, best with different excitation", metavar="REC.csv")
     ],
     out: Annotated[
         Path,

@@ -59,7 +59,7 @@ class Check:
 @app.command()
 def doctor(
     config: Annotated[
-        Path | None, typer.Argument(metavar="[CONFIG.toml]", help="configuration whose rig is looked for too")
+        Path | None, typer.Argument(metavar="CONFIG.toml", help="configuration whose rig is looked for too")
     ] = None,
 ) -> None:
     """Check clock, ports, permissions and compiled code, and say how to fix what is wrong. Commands nothing."""

@@ -272,6 +272,19 @@ def test_help_shows_the_units_of_what_is_asked_for(name: str, units: list[str]) 
     assert [unit for unit in units if unit not in shown] == []
 
 
+@pytest.mark.parametrize("call", [[], ["run"], ["diagnose"], ["identify"], ["paper", "relay"], ["watch"]])
+def test_help_shows_a_call_as_one_types_it(call: list[str]) -> None:
+    shown = CliRunner().invoke(app, [*call, "--help"], env={"COLUMNS": "300", "TERMINAL_WIDTH": "300"}).output
+    assert [
+        word for word in ("bool", "range>", "list[", "{", "[[", "]]") if word in shown.replace("<list[Path]>", "")
+    ] == []
+
+
+def test_every_command_stands_in_a_group_of_the_tour() -> None:
+    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "300", "TERMINAL_WIDTH": "300"}).output
+    assert "─ Commands ─" not in shown
+
+
 def test_a_computer_that_runs_these_tests_is_ready(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     said = command("doctor", CONFIGS / "ball_sim.toml")
