@@ -340,6 +340,12 @@ def _swatch(trace: Mapping[str, Any]) -> str:
         return f'<svg viewBox="0 0 26 10"><rect width="26" height="10" fill="{trace["fillcolor"]}"/></svg>'
     if trace["type"] == "bar" or "markers" in str(trace.get("mode")):
         colour = marker.get("color") or line.get("color", GREY)
+        if marker.get("symbol") == "cross":
+            return f'<svg viewBox="0 0 26 10"><path d="M13 0V10M8 5H18" stroke="{colour}" stroke-width="3"/></svg>'
+        if "lines" in str(trace.get("mode")):
+            bar = f'<path d="M3 5H23" stroke="{colour}" stroke-width="2.4"/>'
+            ends = "".join(f'<circle cx="{x}" cy="5" r="3" fill="{colour}"/>' for x in (3, 23))
+            return f'<svg viewBox="0 0 26 10">{bar}{ends}</svg>'
         return f'<svg viewBox="0 0 26 10"><circle cx="13" cy="5" r="4" fill="{colour}"/></svg>'
     dash = {"dash": "6 3", "dot": "2 3", "dashdot": "6 3 2 3"}.get(line.get("dash", ""), "")
     colour = line.get("color", GREY)

@@ -20,7 +20,7 @@ from autotune.identification.parametric import PlantFit
 from autotune.models import TransferFunction
 from autotune.pipeline.analysis import Analysis, analyse
 from autotune.recording import Recording
-from autotune.report.outlook import outlook_section
+from autotune.report.outlook import outlook_section, outlook_sentences
 from autotune.report.plant_section import model_figures, numbers_table
 
 SIGNALS = SignalSettings(sample_time_s=0.1, u_unit="%", y_unit="degC")
@@ -76,6 +76,25 @@ def test_the_slider_moves_every_trace_and_begins_at_the_designed_one(analysis: A
         assert len(step["args"][0]["visible"]) == len(now)
         assert sum(step["args"][0]["visible"]) == sum(now)
     assert section.tables[0].rows[0][0] == "today"
+
+
+def test_a_controller_of_the_slider_is_named_by_the_margin_that_it_keeps() -> None:
+    """A noise gain that binds keeps the fast ones from being as fast as was asked."""
+    facts = LoopFacts(noise_sd=0.05, u_span=20.0, sample_time_s=0.1)
+    held = analyse((), DesignSettings(noise_gain=8.0), fit=known(OVEN, 0.03), facts=facts)
+    (section,) = outlook_section(held, SIGNALS)
+    others = [row for row in section.tables[0].rows if row[0] != "designed"]
+    assert others
+    for name, _, _, modulus, *_ in others:
+        assert float(str(name).split()[-1]) == pytest.approx(float(str(modulus)), abs=0.0051)
+
+
+def test_a_page_of_a_run_offers_a_set_point_weight_where_steps_overshoot_and_compares_with_before() -> None:
+    facts = LoopFacts(noise_sd=0.05, u_span=20.0, sample_time_s=0.1)
+    fast = analyse((), DesignSettings(noise_gain=50.0), fit=known(OVEN, 0.03), facts=facts)
+    said = " ".join(outlook_sentences(fast, PIDController(K=1.0, Ti_s=90.0)))
+    assert re.search(r"times smaller than with the gains before", said)
+    assert re.search(r"set-point weight b = [\d.]+ the set-point's step overshoots \d+ % instead of \d+ %", said)
 
 
 def test_more_margin_means_less_overshoot_and_a_larger_peak_under_load(analysis: Analysis) -> None:
