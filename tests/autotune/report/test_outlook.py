@@ -49,6 +49,11 @@ def analysis() -> Analysis:
     return analyse((), DesignSettings(noise_gain=50.0), fit=known(OVEN, 0.03), facts=facts)
 
 
+def test_a_recordings_points_are_designed_on_where_they_are_asked_for(analysis: Analysis) -> None:
+    assert analysis.source == "fitted plant"
+    assert "--source points" in str(dict(analysis.alternatives)["points"])
+
+
 def test_the_predicted_steps_are_those_of_the_continuous_loop(analysis: Analysis) -> None:
     (section,) = outlook_section(analysis, SIGNALS)
     row = next(row for row in section.tables[0].rows if row[0] == "designed")
