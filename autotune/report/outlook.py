@@ -174,7 +174,7 @@ def _member(
 
 def _gain_text(designed: Member, before: Member | None, name: str) -> tuple[str, ...]:
     """Return by how much a load's error is smaller than with those of before, where these hold the plant."""
-    if before is None or not before.kept.stable:
+    if before is None or before.controller.K == 0.0 or not before.kept.stable:
         return ()
     now, then = (float(np.sum(np.abs(one.prediction.y[_SAMPLES:] - 1.0))) for one in (designed, before))
     times = f"{then / now:.2g} times smaller" if then > now else f"{now / then:.2g} times larger"

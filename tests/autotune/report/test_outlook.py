@@ -102,6 +102,14 @@ def test_a_page_of_a_run_offers_a_set_point_weight_where_steps_overshoot_and_com
     assert re.search(r"set-point weight b = [\d.]+ the set-point's step overshoots \d+ % instead of \d+ %", said)
 
 
+def test_gains_of_zero_are_no_gains_to_compare_with(analysis: Analysis) -> None:
+    """A device whose controller nobody has set holds them."""
+    unset = PIDController(K=0.0, Ti_s=1.0)
+    assert "gains before" not in " ".join(outlook_sentences(analysis, unset))
+    (section,) = outlook_section(analysis, SIGNALS, present=unset)
+    assert section.tables[0].rows[0][0] == "today"
+
+
 def test_more_margin_means_less_overshoot_and_a_larger_peak_under_load(analysis: Analysis) -> None:
     (section,) = outlook_section(analysis, SIGNALS)
     rows = section.tables[0].rows  # from careful to fast
