@@ -83,13 +83,14 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A heading with paragraphs, links (what they say, and where they lead), then figures and tables, then the method.
+    """A heading with formulas (MathML), paragraphs, links (what they say, and where to), figures, tables, the method.
 
     ``details`` and ``detail_tables`` are for those who want to check the method; they are folded away.
     """
 
     title: str
     text: tuple[str, ...] = ()
+    formulas: tuple[str, ...] = ()
     links: tuple[tuple[str, str], ...] = ()
     tables: tuple[Table, ...] = ()
     figures: tuple[Figure, ...] = ()
@@ -250,6 +251,7 @@ def _text(text: str) -> str:
 
 def _section(section: Section, number: int) -> str:
     parts = [f'<section id="s{number}"><h2>{_text(section.title)}</h2>']
+    parts += [f'<div class="wide">{formula}</div>' for formula in section.formulas]
     parts += [f"<p>{_text(line)}</p>" for line in section.text]
     parts += [f'<p><a href="{html.escape(target)}">{_text(label)}</a></p>' for label, target in section.links]
     parts += [_figure(figure, f"f{number}_{i}") for i, figure in enumerate(section.figures)]
