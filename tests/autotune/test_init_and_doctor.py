@@ -16,6 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from autotune.cli import app
+from autotune.cli.common import announce_compiling
 from autotune.config import load_config
 from autotune.config.registers import RegisterMap
 from autotune.config.rig import ModbusTcpSettings, SerialSettings, SimulatedRigSettings
@@ -349,3 +350,14 @@ def test_a_run_hands_nothing_over_where_a_second_person_is_asked_for(tmp_path: P
     assert "not handed over: [approval] asks for a second person: autotune deploy" in said
     assert (tmp_path / "out" / "journal.jsonl").read_text().count("gains") == 1  # read, and nothing written
     assert not (tmp_path / "out" / "audit.jsonl").exists()
+
+
+def test_the_first_call_after_an_installation_says_that_it_compiles_and_later_ones_do_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    announce_compiling()
+    assert capsys.readouterr().err.startswith("note: compiling, once after an installation")
+    (tmp_path / f"kernels.evaluate-1.py{sys.version_info.major}{sys.version_info.minor}.nbi").touch()
+    announce_compiling()
+    assert capsys.readouterr().err == ""
