@@ -160,7 +160,8 @@ def analyse(
     measured = sorted(points, key=lambda point: point.omega_rad_s)
     usable = of_use(measured)
     left_out = len(measured) - len(usable)
-    beyond = (f"{left_out} points past {LOWEST_PHASE_DEG:g} deg were left out: a PI has no use for them",)
+    said = ("point past {} deg was", "it") if left_out == 1 else ("points past {} deg were", "them")
+    beyond = (f"{left_out} {said[0].format(f'{LOWEST_PHASE_DEG:g}')} left out: a PI has no use for {said[1]}",)
     fit = fit_plant(usable) if fit is None else fit
     usable = _as_independent(usable, fit)
     facts = facts or LoopFacts()
