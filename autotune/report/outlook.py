@@ -216,6 +216,8 @@ def _family(analysis: Analysis, times: FloatArray, load: float) -> list[Member]:
         except AutotuneError:
             continue
         member = _member("", analysis.fit.plant, (), controller, times, load)
+        if abs(member.kept.modulus - analysis.margins.modulus) < APART:
+            continue
         # named by what it keeps: where another margin or the noise gain binds, that is not what was asked
         found.append(replace(member, name=f"M_m\u00a0{member.kept.modulus:.2f}"))
     return found

@@ -42,7 +42,9 @@ def frequency_grid(analysis: Analysis, decades: float) -> FloatArray:
     if analysis.points and analysis.fit.source == "points":
         return frequencies(analysis.points, decades)
     crossover = analysis.margins.crossover_rad_s
-    return np.geomspace(crossover * 10 ** (-decades - 1.0), crossover * 10 ** (decades + 0.3), 400, dtype=np.float64)
+    low, high = crossover * 10 ** (-decades - 1.0), crossover * 10 ** (decades + 0.3)
+    at = [point.omega_rad_s for point in analysis.points]  # a curve ends at no point that it is drawn with
+    return np.geomspace(min([low, *at]), max([high, *(1.2 * omega for omega in at)]), 400, dtype=np.float64)
 
 
 def points_section(analysis: Analysis, signals: SignalSettings, experiment: ExperimentResult | None) -> Section:

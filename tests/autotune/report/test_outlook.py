@@ -19,9 +19,11 @@ from autotune.design.noise import LoopFacts
 from autotune.identification.parametric import PlantFit
 from autotune.models import TransferFunction
 from autotune.pipeline.analysis import Analysis, analyse
+from autotune.points import FrequencyPoint
 from autotune.recording import Recording
-from autotune.report.outlook import outlook_section, outlook_sentences
+from autotune.report.outlook import APART, outlook_section, outlook_sentences
 from autotune.report.plant_section import model_figures, numbers_table
+from autotune.report.points_section import frequency_grid
 
 SIGNALS = SignalSettings(sample_time_s=0.1, u_unit="%", y_unit="degC")
 
@@ -92,6 +94,7 @@ def test_a_controller_of_the_slider_is_named_by_the_margin_that_it_keeps() -> No
     assert others
     for name, _, _, modulus, *_ in others:
         assert float(str(name).split()[-1]) == pytest.approx(float(str(modulus)), abs=0.0051)
+        assert abs(float(str(modulus)) - held.margins.modulus) >= APART
 
 
 def test_a_page_of_a_run_offers_a_set_point_weight_where_steps_overshoot_and_compares_with_before() -> None:
@@ -100,6 +103,15 @@ def test_a_page_of_a_run_offers_a_set_point_weight_where_steps_overshoot_and_com
     said = " ".join(outlook_sentences(fast, PIDController(K=1.0, Ti_s=90.0)))
     assert re.search(r"times smaller than with the gains before", said)
     assert re.search(r"set-point weight b = [\d.]+ the set-point's step overshoots \d+ % instead of \d+ %", said)
+
+
+def test_a_curve_of_the_bode_diagram_ends_at_no_point(analysis: Analysis) -> None:
+    at = (1e-5, 40.0)
+    unknown = ((1.0, 0.0), (0.0, 1.0))
+    points = tuple(FrequencyPoint(omega_rad_s=omega, response=0.5 - 0.5j, covariance=unknown) for omega in at)
+    grid = frequency_grid(replace(analysis, points=points), 0.7)
+    assert grid[0] <= at[0]
+    assert grid[-1] > at[-1]
 
 
 def test_gains_of_zero_are_no_gains_to_compare_with(analysis: Analysis) -> None:
