@@ -24,7 +24,7 @@ Hold: TypeAlias = Literal["zero", "linear"]
 
 @identify.command("delay")
 def identify_delay_command(
-    recording: Annotated[Path, typer.Argument(help="recording of u and y")],
+    recording: Annotated[Path, typer.Argument(metavar="REC.csv", help="recording of u and y")],
     out: Annotated[Path, typer.Option(help="file to write the model to, delay.json")],
     order: Annotated[int, typer.Option(min=1, max=4, help="order n of the model, 1 to 4")] = 2,
     max_delay: Annotated[

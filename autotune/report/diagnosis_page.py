@@ -143,8 +143,8 @@ def _determined_sections(found: Diagnosis) -> tuple[Section, ...]:
         (", ".join(one.parameters), f"{100.0 * one.narrowed:.3g} %", ", ".join(f"{c:+.2g}" for c in one.changes))
         for one in found.search.combinations()
     )
-    table = Table(header=("moves together", "left of the belief's width", "relative changes"), rows=rows)
-    text = "Combinations of numbers, the least determined first: 100 % is what was believed before."
+    table = Table(header=("moves together", "interval, as a share of the prior's", "relative changes"), rows=rows)
+    text = "Combinations of numbers, the least determined first: at 100 % the recordings tell nothing new."
     return (Section(title="What the recordings determine", text=(text,), tables=(table,)),) if rows else ()
 
 
