@@ -179,6 +179,17 @@ class Parameter:
     unit: str = ""
     sd: float = float("nan")
 
+    def __eq__(self, other: object) -> bool:
+        """Whether value, unit and standard deviation are the same; two that are not known are."""
+        if not isinstance(other, Parameter):
+            return NotImplemented
+        unknown = math.isnan(self.sd) and math.isnan(other.sd)
+        return (self.value, self.unit) == (other.value, other.unit) and (unknown or self.sd == other.sd)
+
+    def __hash__(self) -> int:
+        """Return the hash of value and unit: that of a NaN differs from one object to the next."""
+        return hash((self.value, self.unit))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:

@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 
 from autotune.cli.guard import GuardedCommand, without_stdout
+from autotune.cli.plain_help import PlainGroup
 from autotune.errors import AutotuneError, InputError, OperatorStop
 from autotune.interrupts import raise_interrupt
 from autotune.text_files import printable
@@ -24,6 +25,7 @@ ClickException: type[Any] = typer.BadParameter.__mro__[2]
 
 app = typer.Typer(
     name="autotune",
+    cls=PlainGroup,
     help="Commission a control loop: measure its Bode points with a relay, design its controller, verify it.",
     no_args_is_help=True,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -31,7 +33,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",  # rich would take the units in brackets for styles, and show none
 )
-identify = typer.Typer(help="Identify the plant from a recording.", no_args_is_help=True)
+identify = typer.Typer(cls=PlainGroup, help="Identify the plant from a recording.", no_args_is_help=True)
 app.add_typer(identify, name="identify")
 
 
@@ -94,6 +96,7 @@ TOUR = {
         "controller",
     ),
     "In operation, and where model and rig differ": ("watch", "model", "simulate", "diagnose", "batch", "prove"),
+    "What the papers print, computed anew": ("paper",),
 }
 
 

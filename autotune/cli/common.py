@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -61,6 +63,32 @@ def unguarded(config: Config) -> str:
         "no dead-man is mapped: if this computer or the line fails, the device may hold the last command for ever;"
         f" map rig.{place}.heartbeat, or stand at the rig's stop"
     )
+
+
+def kept_code() -> tuple[Path, int]:
+    """Return the folder in which compiled functions are kept, and how many of this Python are there.
+
+    Returns
+    -------
+    folder : Path
+        The one that the environment names, else the package's own.
+    kept : int
+        Number of functions.
+    """
+    import autotune
+
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    folder = Path(given) if given else Path(autotune.__file__).parent
+    of_this = f"*.py{sys.version_info.major}{sys.version_info.minor}*.nbi"
+    return folder, sum(1 for _ in folder.rglob(of_this)) if folder.is_dir() else 0
+
+
+def announce_compiling() -> None:
+    """Say why the first call after an installation takes so long, before it does."""
+    folder, kept = kept_code()
+    # where the package cannot be written the compiler keeps its code elsewhere, and nothing is known of it
+    if not kept and (os.environ.get("NUMBA_CACHE_DIR") or os.access(folder, os.W_OK)):
+        typer.echo("note: compiling, once after an installation: about a minute", err=True)
 
 
 OVERWRITE = Annotated[bool, typer.Option("--overwrite", help="replace what is at --out; an input never is")]
@@ -123,6 +151,7 @@ class ProgressBar:
         self._progress.update(self._task, completed=share, description=what, left="")
 
     def __enter__(self) -> ProgressBar:
+        announce_compiling()
         self._progress.start()
         return self
 

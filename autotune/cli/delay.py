@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 import typer
 
 from autotune.cli import identify
-from autotune.cli.common import OVERWRITE
+from autotune.cli.common import OVERWRITE, announce_compiling
 from autotune.cli.recordings import R, T, U, Y, read_one, signal_names
 from autotune.outputs import Output
 
@@ -24,7 +24,7 @@ Hold: TypeAlias = Literal["zero", "linear"]
 
 @identify.command("delay")
 def identify_delay_command(
-    recording: Annotated[Path, typer.Argument(help="recording of u and y")],
+    recording: Annotated[Path, typer.Argument(metavar="REC.csv", help="recording of u and y")],
     out: Annotated[Path, typer.Option(help="file to write the model to, delay.json")],
     order: Annotated[int, typer.Option(min=1, max=4, help="order n of the model, 1 to 4")] = 2,
     max_delay: Annotated[
@@ -81,6 +81,7 @@ def identify_delay_command(
     record = read_one(recording, signal_names(t, u, y, r))
     if hold is not None:
         record = replace(record, metadata={**record.metadata, "hold": hold})
+    announce_compiling()
     require_answer([record])
     settings: dict[str, Any] = {}
     with Console(stderr=True).status("searching the delay") as status:

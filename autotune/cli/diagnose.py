@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from autotune.cli import app
-from autotune.cli.common import OVERWRITE
+from autotune.cli.common import OVERWRITE, announce_compiling
 from autotune.cli.recordings import R, T, U, Y, read_all, read_one, signal_names
 from autotune.errors import InputError
 from autotune.outputs import Output, OutputFolder
@@ -84,7 +84,7 @@ def _warn_beyond(model: Model, recording: Recording, y_sim: FloatArray) -> None:
 @app.command()
 def diagnose(
     recordings: Annotated[
-        list[Path], typer.Argument(help="recordings, best with different excitation", metavar="REC.csv...")
+        list[Path], typer.Argument(help="recordings, best with different excitation", metavar="REC.csv")
     ],
     out: Annotated[
         Path,
@@ -144,6 +144,7 @@ def diagnose(
     require_units_of_model(nominal, data)
     law = None if controller is None else read_controller(controller)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    announce_compiling()
     # many short products: waiting for each other costs linear algebra's threads more than they save
     with threadpool_limits(1), Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("diagnosing", total=1.0)

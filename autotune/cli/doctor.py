@@ -19,7 +19,7 @@ from packaging.requirements import Requirement
 from rich.console import Console
 
 from autotune.cli import app
-from autotune.cli.common import unguarded
+from autotune.cli.common import kept_code, unguarded
 from autotune.errors import InputError
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class Check:
 @app.command()
 def doctor(
     config: Annotated[
-        Path | None, typer.Argument(metavar="[CONFIG.toml]", help="configuration whose rig is looked for too")
+        Path | None, typer.Argument(metavar="CONFIG.toml", help="configuration whose rig is looked for too")
     ] = None,
 ) -> None:
     """Check clock, ports, permissions and compiled code, and say how to fix what is wrong. Commands nothing."""
@@ -133,20 +133,15 @@ def _extra() -> Check:
 
 def _check_compiled() -> Check:
     """Say whether the inner loops are compiled already, and whether they can be kept."""
-    import autotune
-
-    package = Path(autotune.__file__).parent
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    own = Path(given) if given else package
-    kept = sum(1 for _ in own.rglob("*.nbi")) if own.is_dir() else 0
+    own, kept = kept_code()
     subject = "compiled code"
     # where the package cannot be written the compiler keeps its code in the user's cache folder
-    places = [own] if given else [package, Path.home()]
+    places = [own] if os.environ.get("NUMBA_CACHE_DIR") else [own, Path.home()]
     if not any(os.access(place, os.W_OK) for place in places):
-        remedy = "set NUMBA_CACHE_DIR to a folder you may write; every run compiles for one to two minutes otherwise"
+        remedy = "set NUMBA_CACHE_DIR to a folder you may write; every run compiles for about a minute otherwise"
         return Check(subject=subject, found=f"cannot be kept in {places[0]}", verdict="note", remedy=remedy)
     if not kept:
-        remedy = "nothing to do: the first run compiles for one to two minutes"
+        remedy = "nothing to do: the first run compiles for about a minute"
         return Check(subject=subject, found="none yet", verdict="note", remedy=remedy)
     return Check(subject=subject, found=f"{kept} functions kept in {own}")
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @identify.command("frequency")
 def frequency(
-    recordings: Annotated[list[Path], typer.Argument(help="recordings; with r where it moved")],
+    recordings: Annotated[list[Path], typer.Argument(metavar="REC.csv", help="recordings; with r where it moved")],
     out: Annotated[Path, typer.Option(help="points file to write (JSON)")],
     largest_sd: Annotated[
         float,

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import typer
-from typer.core import TyperCommand
 
+from autotune.cli.plain_help import PlainCommand
 from autotune.errors import AutotuneError, ExperimentStopped, InputError, OperatorStop, Unforeseen, UnforeseenAtRig
 from autotune.outputs import unwritable
 from autotune.text_files import printable, reason
@@ -35,7 +35,7 @@ _CLICK_EXCEPTION: type[Exception] = typer.BadParameter.__mro__[2]  # typer bring
 _RIG_IN_COMMAND: ContextVar[bool] = ContextVar("rig in command", default=False)
 
 
-class GuardedCommand(TyperCommand):
+class GuardedCommand(PlainCommand):
     """A command whose every end is one of the project's errors, or click's own."""
 
     def invoke(self, ctx: Any) -> Any:

@@ -26,7 +26,7 @@ def investigate(
         Path, typer.Option(help="new folder for recordings, rounds.json and the diagnosis's files", metavar="DIR")
     ],
     recordings: Annotated[
-        list[Path] | None, typer.Argument(metavar="[REC.csv ...]", help="what has been recorded already")
+        list[Path] | None, typer.Argument(metavar="REC.csv", help="what has been recorded already")
     ] = None,
     rounds: Annotated[int, typer.Option(min=1, max=20, help="most experiments")] = 3,
     duration: Annotated[

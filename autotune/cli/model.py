@@ -9,13 +9,14 @@ import typer
 
 from autotune.cli import app
 from autotune.cli.common import OVERWRITE
+from autotune.cli.plain_help import PlainGroup
 from autotune.outputs import Output
 
 if TYPE_CHECKING:
     from autotune.equations.model import EquationModel
     from autotune.models import Model
 
-model_app = typer.Typer(help="Model files from other tools and for other tools.", no_args_is_help=True)
+model_app = typer.Typer(cls=PlainGroup, help="Model files from other tools and for other tools.", no_args_is_help=True)
 app.add_typer(model_app, name="model")
 
 Form = Literal["toml", "text", "latex", "modelica", "python"]

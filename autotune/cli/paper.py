@@ -9,6 +9,7 @@ import typer
 
 from autotune.cli import app
 from autotune.cli.common import OVERWRITE
+from autotune.cli.plain_help import PlainGroup
 from autotune.errors import InputError
 from autotune.outputs import Output
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from autotune.recording import Recording
     from autotune.report.relay_tables import Law
 
-paper = typer.Typer(help="Draw the figures and tables of the papers.", no_args_is_help=True)
+paper = typer.Typer(cls=PlainGroup, help="Draw the figures and tables of the papers.", no_args_is_help=True)
 app.add_typer(paper, name="paper")
 
 #: Title, method and window of figures 2 to 5.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from autotune.cli.common import announce_compiling
 from autotune.cli.recordings import read_all
 from autotune.errors import InputError
 from autotune.outputs import OutputFolder
@@ -54,6 +55,7 @@ def look_at(
     place = OutputFolder(out, ("routine.json", "report.html"), inputs=tuple(recordings), overwrite=overwrite)
     data = read_all(recordings, names)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    announce_compiling()
     with threadpool_limits(1), Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("looking", total=1.0)
         found = diagnose_routine(

@@ -188,9 +188,7 @@ def _pid_in_use(path: Path) -> PIDController:
 @app.command()
 def tune(
     out: _OUT,
-    recordings: Annotated[
-        list[Path] | None, typer.Argument(metavar="[REC.csv ...]", help="recordings of the plant")
-    ] = None,
+    recordings: Annotated[list[Path] | None, typer.Argument(metavar="REC.csv", help="recordings of the plant")] = None,
     points: Annotated[
         list[Path] | None,
         typer.Option(

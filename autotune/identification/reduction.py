@@ -276,7 +276,7 @@ def _choose(fitted: Sequence[FrequencyPoint], fit: PlantFit, kind: Kind | None) 
     if fit.integrating:
         return "integrating", "an integrator with lags and dead time explains the points best", ()
     if static_sd <= _STATIC_GAIN_SD:
-        return "self-regulating", f"the points determine the static gain to {100 * static_sd:.1g} %", ()
+        return "self-regulating", f"the points determine the static gain to {100 * static_sd:.2g} %", ()
     return (
         "integrating",
         f"self-regulating, but the points {_open_gain(static_sd)}",

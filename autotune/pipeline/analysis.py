@@ -148,7 +148,7 @@ def analyse(
     facts : LoopFacts, optional
         Noise, range and sample time, for what the settings leave open.
     compare : bool
-        Whether to design on the other bases too; the design on the points takes more than all the rest.
+        Whether to design on the other bases too; on a plain recording's few points only where the settings ask for it.
     progress : Progress
         Told what is being done.
 
@@ -160,7 +160,8 @@ def analyse(
     measured = sorted(points, key=lambda point: point.omega_rad_s)
     usable = of_use(measured)
     left_out = len(measured) - len(usable)
-    beyond = (f"{left_out} points past {LOWEST_PHASE_DEG:g} deg were left out: a PI has no use for them",)
+    said = ("point past {} deg was", "it") if left_out == 1 else ("points past {} deg were", "them")
+    beyond = (f"{left_out} {said[0].format(f'{LOWEST_PHASE_DEG:g}')} left out: a PI has no use for {said[1]}",)
     fit = fit_plant(usable) if fit is None else fit
     usable = _as_independent(usable, fit)
     facts = facts or LoopFacts()
@@ -176,6 +177,8 @@ def analyse(
     progress("designing on the other bases, for comparison", 0.5)
     # shown by their gains and margins: no bound on their norm is proved, which takes longer than all of them
     beside = _bases(usable, fit, lambda: reduced, asked, settings.kind, certificate=False)
+    if fit.source == "recording":
+        beside["points"] = _refuse_unasked
     others = tuple((name, _or_reason(make)) for name, make in beside.items() if name != source) if compare else ()
     return Analysis(
         points=tuple(measured),
@@ -300,6 +303,11 @@ def _bases(
         "reduced model": on_reduced,
     }
     return {name: ways[name] for name in sorted(ways, key=lambda name: fit.source == "recording" and name == "points")}
+
+
+def _refuse_unasked() -> Design:
+    """Raise what stands in place of a design on a recording's few points: it takes a third of all the time."""
+    raise DesignError("not designed on beside the fitted plant: --source points does", where="points")
 
 
 def _first_kept(

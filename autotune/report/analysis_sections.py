@@ -85,7 +85,13 @@ def _model_section(analysis: Analysis, signals: SignalSettings) -> Section:
     if reduced is None or analysis.unscaled is None or analysis.scaled is None:
         why = dict(analysis.alternatives).get("reduced model", "")
         return Section(
-            title="Model", text=(fitted, f"There is no reduced model: {why}." if isinstance(why, str) and why else "")
+            title="Model",
+            text=(
+                fitted,
+                f"There is no reduced model: {why.removeprefix('reduced model: ')}."
+                if isinstance(why, str) and why
+                else "",
+            ),
         )
     lag = [("lag frequency ω_0r [rad/s]", f"{reduced.omega_0r_rad_s:.4g}")] if reduced.omega_0r_rad_s else []
     return Section(
@@ -134,14 +140,15 @@ def _validation_row(validation: Validation) -> tuple[str, str, str, str, str]:
 def _transfer_text(fit: PlantFit, signals: SignalSettings) -> str:
     plant = fit.plant
     slow = [p for p in plant.poles if p != 0.0 and p.imag >= 0.0]
-    lags = ", ".join(
-        f"{-1.0 / p.real:.3g} s" if p.imag == 0.0 else f"{abs(p):.3g} rad/s with damping {-p.real / abs(p):.2g}"
-        for p in slow
+    lags = ", ".join(f"{-1.0 / p.real:.3g} s" for p in slow if p.imag == 0.0)
+    pairs = "".join(
+        f", an oscillating pair at {abs(p):.3g} rad/s with damping {-p.real / abs(p):.2g}" for p in slow if p.imag > 0.0
     )
     gain = plant.num[-1] / plant.den[-1 - plant.integrators]
     kind = "integrator" if plant.integrators else "no integrator"
     size = with_units(gain, signals.y_unit, f"{signals.u_unit} s" if plant.integrators else signals.u_unit)
-    return f"gain {size}, {kind}, lags {lags or 'none'}, dead time {plant.delay_s:.3g} s"
+    lagging = f"lags {lags}" if lags else "no lag"
+    return f"gain {size}, {kind}, {lagging}{pairs}, dead time {plant.delay_s:.3g} s"
 
 
 def _loop_section(analysis: Analysis, signals: SignalSettings) -> Section:

@@ -72,7 +72,7 @@ def campaign_page(settings: CampaignSettings, rows: Sequence[Row]) -> Page:
     counts = Counter(row.attention for row in rows)
     tone: Tone = "bad" if counts["act"] else "warn" if counts["failed"] or counts["look"] else "good"
     said = ", ".join(
-        f"{counts[attention]} {_WORDS[attention][counts[attention] > 1]}"
+        f"{counts[attention]} {_words(settings)[attention][counts[attention] > 1]}"
         for attention in ATTENTION
         if counts[attention]
     )
@@ -94,10 +94,20 @@ def campaign_page(settings: CampaignSettings, rows: Sequence[Row]) -> Page:
         verdict=f"Of {len(rows)} loops, {said}.",
         tone=tone,
         answers=_answers(counts, settings),
-        drawing=glance(rows, _COLOURS, _TITLES),
+        drawing=glance(rows, _COLOURS, _titles(settings)),
         summary=tuple(summary),
         sections=(*sections, *_present_margins(settings, rows), *_notes(rows)),
     )
+
+
+def _titles(settings: CampaignSettings) -> dict[Attention, str]:
+    """Return the titles of the tables: a loop that was only identified is not known to be fine."""
+    return _TITLES | ({"fine": "Identified"} if settings.task == "identify" else {})
+
+
+def _words(settings: CampaignSettings) -> dict[Attention, tuple[str, str]]:
+    """Return what the loops of a table are said to be, of one and of several."""
+    return _WORDS | ({"fine": ("is identified", "are identified")} if settings.task == "identify" else {})
 
 
 def _answers(counts: Counter[Attention], settings: CampaignSettings) -> tuple[tuple[str, str], ...]:
@@ -110,7 +120,9 @@ def _answers(counts: Counter[Attention], settings: CampaignSettings) -> tuple[tu
         "failed": "Read why the loops under 'Not analysed' failed; each names its remedy.",
         "look": "Look at the loops that could do better when there is time.",
         "designed": "Try the new gains; where K and Ti_s of today are given, loops are ranked by what is to be gained.",
-        "fine": "Nothing to do.",
+        "fine": "Nothing to do."
+        if settings.task != "identify"
+        else 'Nothing is said of the gains in use: task = "design" looks for better ones.',
     }
     sure = "Every figure rests on the loop's own record; what was left out of it is said under Notes."
     return ("How sure", sure), ("What to do", todo[first])
@@ -130,7 +142,7 @@ def _section(settings: CampaignSettings, attention: Attention, rows: Sequence[Ro
     table = Table(
         header=tuple(list(columns)[i] for i in shown), rows=tuple(tuple(line[i] for i in shown) for line in cells)
     )
-    return Section(title=f"{_TITLES[attention]} ({len(chosen)})", tables=(table,))
+    return Section(title=f"{_titles(settings)[attention]} ({len(chosen)})", tables=(table,))
 
 
 def _number(value: float | None, form: str = ".4g") -> str:

@@ -154,7 +154,8 @@ def _notes(link: Link) -> int:
 
 def _width(link: Link) -> float:
     texts = [*_wrap(link.label), *_wrap(link.below, lines=1), *_note_lines(link, _WRAP)]
-    return max(78.0, 20.0 + _LETTER * max(len(text) for text in texts))
+    rounded = 16.0 if link.place in ("command", "reading") else 0.0
+    return max(78.0, 20.0 + rounded + _LETTER * max(len(text) for text in texts))
 
 
 def _arrow(x0: float, y0: float, x1: float, y1: float) -> str:

@@ -19,6 +19,7 @@ from autotune.models import Parameter
 from autotune.report.chain_diagram import chain_diagram
 from autotune.report.diagnosis_words import answers, in_the_model, objections, places_of, verdict_of
 from autotune.report.effect_words import clause, in_short, number, of_candidate, sentence, with_spread
+from autotune.report.formulas import model_formulas
 from autotune.report.law_figures import acting_figure, file_names, free_run_figure, law_figure
 from autotune.report.page import Figure, Page, Section, Table, Tone, write_page
 from autotune.report.screen_figures import curve_figure, over_time, screen_sections, trace_figures
@@ -142,8 +143,8 @@ def _determined_sections(found: Diagnosis) -> tuple[Section, ...]:
         (", ".join(one.parameters), f"{100.0 * one.narrowed:.3g} %", ", ".join(f"{c:+.2g}" for c in one.changes))
         for one in found.search.combinations()
     )
-    table = Table(header=("moves together", "left of the belief's width", "relative changes"), rows=rows)
-    text = "Combinations of numbers, the least determined first: 100 % is what was believed before."
+    table = Table(header=("moves together", "interval, as a share of the prior's", "relative changes"), rows=rows)
+    text = "Combinations of numbers, the least determined first: at 100 % the recordings tell nothing new."
     return (Section(title="What the recordings determine", text=(text,), tables=(table,)),) if rows else ()
 
 
@@ -153,10 +154,10 @@ def _equations(found: Diagnosis) -> tuple[Section, ...]:
     if not isinstance(model, EquationModel):
         return ()
     try:
-        lines = as_text(model).splitlines()
+        formulas, lines = model_formulas(model), as_text(model).split("\n\n")[-1].splitlines()
     except InputError:
-        lines = ["Effects on samples are listed in extended_model.toml."]
-    return (Section(title="The model to go on with", text=tuple(line for line in lines if line)),)
+        formulas, lines = (), ["Effects on samples are listed in extended_model.toml."]
+    return (Section(title="The model to go on with", formulas=formulas, text=tuple(line for line in lines if line)),)
 
 
 def _share(error: float) -> str:

@@ -60,7 +60,14 @@ def recording_figure(
     for time_s, name in marks:
         figure.add_vline(x=time_s, line={"color": GREY, "width": 1, "dash": "dot"})
         figure.add_annotation(
-            x=time_s, y=1.0, yref="paper", text=name, showarrow=False, textangle=-90, xanchor="left", yanchor="top"
+            x=time_s,
+            y=1.0,
+            yref="paper",
+            text=name,
+            showarrow=False,
+            textangle=-90 if len(name) > 2 else 0,
+            xanchor="left",
+            yanchor="top",
         )
     return figure
 
@@ -141,7 +148,8 @@ def bode_figure(
     figure.update_xaxes(title="angular frequency [rad/s]", row=2, col=1)
     figure.update_yaxes(type="log", title=axis_title("gain", gain_unit), dtick=_log_ticks(gains), row=1, col=1)
     low, high, step = phase_axis(measured, drawn)
-    figure.update_yaxes(title="phase [deg]", dtick=step, range=[low, high], row=2, col=1)
+    room = 0.05 * (high - low)  # the lowest tick's number is not to meet the first one of the frequency axis
+    figure.update_yaxes(title="phase [deg]", dtick=step, range=[low - room, high], row=2, col=1)
     return figure
 
 

@@ -90,7 +90,7 @@ def outlook_section(
                 f"Predicted, not measured: a step of the set-point by {_amount(1.0, signals.y_unit)}, then one of the"
                 f" load by {_amount(load, signals.u_unit)}. The band holds 95 % of {DRAWS} plants drawn from what the"
                 " data leave open.",
-                *_gain_text(designed, before),
+                *_gain_text(designed, before, "today's gains"),
                 *_weight_text(designed, fit.plant, times, load),
             ),
             tables=(
@@ -118,6 +118,28 @@ def outlook_section(
             ),
         ),
     )
+
+
+@on_one_thread
+def outlook_sentences(analysis: Analysis, present: PIDController | None = None) -> tuple[str, ...]:
+    """Return how much better than those before the new ones are, and a set-point weight where steps overshoot much.
+
+    Parameters
+    ----------
+    analysis : Analysis
+        Plant and controller.
+    present : PIDController, optional
+        The gains that were in use before.
+    """
+    fit, controller = analysis.fit, analysis.controller
+    if not analysis.margins.stable or not math.isfinite(analysis.margins.crossover_rad_s):
+        return ()
+    times, load = _times(analysis, present), abs(controller.K)
+    designed = _member("designed", fit.plant, (), controller, times, load)
+    before = None if present is None else _member("today", fit.plant, (), present, times, load)
+    weight = _weight_text(designed, fit.plant, times, load)
+    sentences = (*_gain_text(designed, before, "the gains before"), *weight)
+    return (" ".join(("By the fitted plant:", *sentences)),) if sentences else ()
 
 
 def _amount(value: float, unit: str) -> str:
@@ -150,13 +172,13 @@ def _member(
     return Member(name=name, controller=controller, kept=margins(plant, controller), worst=worst, prediction=found)
 
 
-def _gain_text(designed: Member, before: Member | None) -> tuple[str, ...]:
-    """Return by how much a load's error is smaller than with today's gains, where these hold the plant."""
-    if before is None or not before.kept.stable:
+def _gain_text(designed: Member, before: Member | None, name: str) -> tuple[str, ...]:
+    """Return by how much a load's error is smaller than with those of before, where these hold the plant."""
+    if before is None or before.controller.K == 0.0 or not before.kept.stable:
         return ()
     now, then = (float(np.sum(np.abs(one.prediction.y[_SAMPLES:] - 1.0))) for one in (designed, before))
     times = f"{then / now:.2g} times smaller" if then > now else f"{now / then:.2g} times larger"
-    return (f"The integral of the error that a load leaves is {times} than with today's gains.",)
+    return (f"The integral of the error that a load leaves is {times} than with {name}.",)
 
 
 def _weight_text(designed: Member, plant: TransferFunction, t: FloatArray, load: float) -> tuple[str, ...]:
@@ -193,7 +215,11 @@ def _family(analysis: Analysis, times: FloatArray, load: float) -> list[Member]:
             controller = design(analysis.fit.plant, other, kind, certificate=False).controller  # type: ignore[arg-type]
         except AutotuneError:
             continue
-        found.append(_member(f"M_m {modulus:g}", analysis.fit.plant, (), controller, times, load))
+        member = _member("", analysis.fit.plant, (), controller, times, load)
+        if abs(member.kept.modulus - analysis.margins.modulus) < APART:
+            continue
+        # named by what it keeps: where another margin or the noise gain binds, that is not what was asked
+        found.append(replace(member, name=f"M_m\u00a0{member.kept.modulus:.2f}"))
     return found
 
 

@@ -83,13 +83,14 @@ class Figure:
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """A heading with paragraphs, links (what they say, and where they lead), then figures and tables, then the method.
+    """A heading with formulas (MathML), paragraphs, links (what they say, and where to), figures, tables, the method.
 
     ``details`` and ``detail_tables`` are for those who want to check the method; they are folded away.
     """
 
     title: str
     text: tuple[str, ...] = ()
+    formulas: tuple[str, ...] = ()
     links: tuple[tuple[str, str], ...] = ()
     tables: tuple[Table, ...] = ()
     figures: tuple[Figure, ...] = ()
@@ -250,6 +251,7 @@ def _text(text: str) -> str:
 
 def _section(section: Section, number: int) -> str:
     parts = [f'<section id="s{number}"><h2>{_text(section.title)}</h2>']
+    parts += [f'<div class="wide">{formula}</div>' for formula in section.formulas]
     parts += [f"<p>{_text(line)}</p>" for line in section.text]
     parts += [f'<p><a href="{html.escape(target)}">{_text(label)}</a></p>' for label, target in section.links]
     parts += [_figure(figure, f"f{number}_{i}") for i, figure in enumerate(section.figures)]
@@ -340,6 +342,12 @@ def _swatch(trace: Mapping[str, Any]) -> str:
         return f'<svg viewBox="0 0 26 10"><rect width="26" height="10" fill="{trace["fillcolor"]}"/></svg>'
     if trace["type"] == "bar" or "markers" in str(trace.get("mode")):
         colour = marker.get("color") or line.get("color", GREY)
+        if marker.get("symbol") == "cross":
+            return f'<svg viewBox="0 0 26 10"><path d="M13 0V10M8 5H18" stroke="{colour}" stroke-width="3"/></svg>'
+        if "lines" in str(trace.get("mode")):
+            bar = f'<path d="M3 5H23" stroke="{colour}" stroke-width="2.4"/>'
+            ends = "".join(f'<circle cx="{x}" cy="5" r="3" fill="{colour}"/>' for x in (3, 23))
+            return f'<svg viewBox="0 0 26 10">{bar}{ends}</svg>'
         return f'<svg viewBox="0 0 26 10"><circle cx="13" cy="5" r="4" fill="{colour}"/></svg>'
     dash = {"dash": "6 3", "dot": "2 3", "dashdot": "6 3 2 3"}.get(line.get("dash", ""), "")
     colour = line.get("color", GREY)

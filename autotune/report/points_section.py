@@ -42,7 +42,9 @@ def frequency_grid(analysis: Analysis, decades: float) -> FloatArray:
     if analysis.points and analysis.fit.source == "points":
         return frequencies(analysis.points, decades)
     crossover = analysis.margins.crossover_rad_s
-    return np.geomspace(crossover * 10 ** (-decades - 1.0), crossover * 10 ** (decades + 0.3), 400, dtype=np.float64)
+    low, high = crossover * 10 ** (-decades - 1.0), crossover * 10 ** (decades + 0.3)
+    at = [point.omega_rad_s for point in analysis.points]  # a curve ends at no point that it is drawn with
+    return np.geomspace(min([low, *at]), max([high, *(1.2 * omega for omega in at)]), 400, dtype=np.float64)
 
 
 def points_section(analysis: Analysis, signals: SignalSettings, experiment: ExperimentResult | None) -> Section:
@@ -88,12 +90,7 @@ def points_section(analysis: Analysis, signals: SignalSettings, experiment: Expe
             Figure(
                 figure=bode_figure(estimates, curves, omega, sign, gain_unit),
                 caption=("Gain and phase, the phase for the positive gain." if sign < 0 else "Gain and phase.")
-                + (
-                    " The reduced model lies above the gain and below the phase of the points: margins that a"
-                    " controller keeps on it hold for the plant."
-                    if analysis.reduced is not None
-                    else ""
-                ),
+                + _bound_text(analysis),
                 height_px=560,
             ),
         ),
@@ -104,6 +101,27 @@ def points_section(analysis: Analysis, signals: SignalSettings, experiment: Expe
         if compared
         else (),
         detail_tables=(compared,) if compared else (),
+    )
+
+
+def _bound_text(analysis: Analysis) -> str:
+    """Return what the reduced model bounds, as far as the figure shows it."""
+    if analysis.reduced is None:
+        return ""
+    omega = np.array([point.omega_rad_s for point in analysis.points])
+    sign = analysis.fit.sign
+    gain, phase = gain_phase(sign * analysis.reduced.response(omega))
+    at, lag = gain_phase(np.array([sign * point.response for point in analysis.points], dtype=np.complex128))
+    bounded = (gain >= at) & ((phase <= lag) | (lag < -180.0))
+    if not bounded.all():
+        return (
+            f" The reduced model lies above the gain and below the phase of {int(bounded.sum())} of {omega.size}"
+            " points; it bounds the plants that fit all points together."
+        )
+    until = "" if (phase <= lag).all() else " down to -180 deg, which is as far as the margins need it"
+    return (
+        f" The reduced model lies above the gain and below the phase of the points{until}: margins that a controller"
+        " keeps on it hold for the plant."
     )
 
 

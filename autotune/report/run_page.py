@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 from autotune.config.procedure import SignalSettings
@@ -17,7 +18,7 @@ from autotune.report.analysis_sections import analysis_sections, warnings_sectio
 from autotune.report.analysis_words import designed_text, gains_text, margins_sentence
 from autotune.report.experiment_section import experiment_section
 from autotune.report.figures import ratio_title, recording_figure
-from autotune.report.outlook import outlook_section
+from autotune.report.outlook import outlook_section, outlook_sentences
 from autotune.report.page import Figure, Page, Section, Table
 from autotune.report.verification_section import verification_section
 
@@ -49,7 +50,11 @@ def run_page(
         Whether the rig's simulated twin took its place.
     """
     experiment, verification = tuning.experiment, tuning.verification
-    sections = [] if verification is None else [verification_section(verification, signals)]
+    sections = []
+    if verification is not None:
+        tried = verification_section(verification, signals)
+        told = outlook_sentences(tuning.analysis, tuning.old_controller)
+        sections.append(replace(tried, text=(*tried.text, *told)))
     if diagnosis is not None:
         sections.append(_diagnosis_section(diagnosis))
     if verification is None:

@@ -16,6 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from autotune.cli import app
+from autotune.cli.common import announce_compiling
 from autotune.config import load_config
 from autotune.config.registers import RegisterMap
 from autotune.config.rig import ModbusTcpSettings, SerialSettings, SimulatedRigSettings
@@ -272,6 +273,19 @@ def test_help_shows_the_units_of_what_is_asked_for(name: str, units: list[str]) 
     assert [unit for unit in units if unit not in shown] == []
 
 
+@pytest.mark.parametrize("call", [[], ["run"], ["diagnose"], ["identify"], ["paper", "relay"], ["watch"]])
+def test_help_shows_a_call_as_one_types_it(call: list[str]) -> None:
+    shown = CliRunner().invoke(app, [*call, "--help"], env={"COLUMNS": "300", "TERMINAL_WIDTH": "300"}).output
+    assert [
+        word for word in ("bool", "range>", "list[", "{", "[[", "]]") if word in shown.replace("<list[Path]>", "")
+    ] == []
+
+
+def test_every_command_stands_in_a_group_of_the_tour() -> None:
+    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "300", "TERMINAL_WIDTH": "300"}).output
+    assert "─ Commands ─" not in shown
+
+
 def test_a_computer_that_runs_these_tests_is_ready(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     said = command("doctor", CONFIGS / "ball_sim.toml")
@@ -336,3 +350,14 @@ def test_a_run_hands_nothing_over_where_a_second_person_is_asked_for(tmp_path: P
     assert "not handed over: [approval] asks for a second person: autotune deploy" in said
     assert (tmp_path / "out" / "journal.jsonl").read_text().count("gains") == 1  # read, and nothing written
     assert not (tmp_path / "out" / "audit.jsonl").exists()
+
+
+def test_the_first_call_after_an_installation_says_that_it_compiles_and_later_ones_do_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    announce_compiling()
+    assert capsys.readouterr().err.startswith("note: compiling, once after an installation")
+    (tmp_path / f"kernels.evaluate-1.py{sys.version_info.major}{sys.version_info.minor}.nbi").touch()
+    announce_compiling()
+    assert capsys.readouterr().err == ""

@@ -131,3 +131,12 @@ def test_how_far_a_signal_leaves_the_recorded_range_is_counted_in_its_spans(
     assert found == pytest.approx(beyond, abs=1e-6 * (1.0 + abs(low) / span))
     assert share <= 1.0 / 3.0
     assert port.beyond(2.0 * low + span - above)[0] == pytest.approx(found, abs=1e-6 * (1.0 + abs(low) / span))
+
+
+def test_parameters_of_unknown_standard_deviation_are_equal_and_one_in_a_set() -> None:
+    """Whichever NaN stands for it: Python 3.13 compares fields one by one, and no NaN equals itself."""
+    one, other = Parameter(value=0.2, unit="V"), Parameter(value=0.2, unit="V", sd=float("nan"))
+    assert one == other
+    assert len({one, other}) == 1
+    assert one != Parameter(value=0.2, unit="V", sd=0.1)
+    assert one != Parameter(value=0.2, unit="A")

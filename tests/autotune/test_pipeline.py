@@ -273,3 +273,5 @@ def test_points_past_a_pi_s_use_are_left_out_of_the_analysis_and_said() -> None:
     assert whole.design == alone.design
     assert whole.points == (*of_use, *beyond)
     assert whole.warnings == ("3 points past -270 deg were left out: a PI has no use for them", *alone.warnings)
+    one = analyse([*of_use, beyond[0]], DesignSettings(), compare=False).warnings[0]
+    assert one == "1 point past -270 deg was left out: a PI has no use for it"

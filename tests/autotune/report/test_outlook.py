@@ -19,9 +19,11 @@ from autotune.design.noise import LoopFacts
 from autotune.identification.parametric import PlantFit
 from autotune.models import TransferFunction
 from autotune.pipeline.analysis import Analysis, analyse
+from autotune.points import FrequencyPoint
 from autotune.recording import Recording
-from autotune.report.outlook import outlook_section
+from autotune.report.outlook import APART, outlook_section, outlook_sentences
 from autotune.report.plant_section import model_figures, numbers_table
+from autotune.report.points_section import frequency_grid
 
 SIGNALS = SignalSettings(sample_time_s=0.1, u_unit="%", y_unit="degC")
 
@@ -47,6 +49,11 @@ OVEN = TransferFunction(num=(0.8,), den=(90.0, 1.0), delay_s=8.0)
 def analysis() -> Analysis:
     facts = LoopFacts(noise_sd=0.05, u_span=20.0, sample_time_s=0.1)
     return analyse((), DesignSettings(noise_gain=50.0), fit=known(OVEN, 0.03), facts=facts)
+
+
+def test_a_recordings_points_are_designed_on_where_they_are_asked_for(analysis: Analysis) -> None:
+    assert analysis.source == "fitted plant"
+    assert "--source points" in str(dict(analysis.alternatives)["points"])
 
 
 def test_the_predicted_steps_are_those_of_the_continuous_loop(analysis: Analysis) -> None:
@@ -75,6 +82,43 @@ def test_the_slider_moves_every_trace_and_begins_at_the_designed_one(analysis: A
     for step in slider["steps"]:
         assert len(step["args"][0]["visible"]) == len(now)
         assert sum(step["args"][0]["visible"]) == sum(now)
+    assert section.tables[0].rows[0][0] == "today"
+
+
+def test_a_controller_of_the_slider_is_named_by_the_margin_that_it_keeps() -> None:
+    """A noise gain that binds keeps the fast ones from being as fast as was asked."""
+    facts = LoopFacts(noise_sd=0.05, u_span=20.0, sample_time_s=0.1)
+    held = analyse((), DesignSettings(noise_gain=8.0), fit=known(OVEN, 0.03), facts=facts)
+    (section,) = outlook_section(held, SIGNALS)
+    others = [row for row in section.tables[0].rows if row[0] != "designed"]
+    assert others
+    for name, _, _, modulus, *_ in others:
+        assert float(str(name).split()[-1]) == pytest.approx(float(str(modulus)), abs=0.0051)
+        assert abs(float(str(modulus)) - held.margins.modulus) >= APART
+
+
+def test_a_page_of_a_run_offers_a_set_point_weight_where_steps_overshoot_and_compares_with_before() -> None:
+    facts = LoopFacts(noise_sd=0.05, u_span=20.0, sample_time_s=0.1)
+    fast = analyse((), DesignSettings(noise_gain=50.0), fit=known(OVEN, 0.03), facts=facts)
+    said = " ".join(outlook_sentences(fast, PIDController(K=1.0, Ti_s=90.0)))
+    assert re.search(r"times smaller than with the gains before", said)
+    assert re.search(r"set-point weight b = [\d.]+ the set-point's step overshoots \d+ % instead of \d+ %", said)
+
+
+def test_a_curve_of_the_bode_diagram_ends_at_no_point(analysis: Analysis) -> None:
+    at = (1e-5, 40.0)
+    unknown = ((1.0, 0.0), (0.0, 1.0))
+    points = tuple(FrequencyPoint(omega_rad_s=omega, response=0.5 - 0.5j, covariance=unknown) for omega in at)
+    grid = frequency_grid(replace(analysis, points=points), 0.7)
+    assert grid[0] <= at[0]
+    assert grid[-1] > at[-1]
+
+
+def test_gains_of_zero_are_no_gains_to_compare_with(analysis: Analysis) -> None:
+    """A device whose controller nobody has set holds them."""
+    unset = PIDController(K=0.0, Ti_s=1.0)
+    assert "gains before" not in " ".join(outlook_sentences(analysis, unset))
+    (section,) = outlook_section(analysis, SIGNALS, present=unset)
     assert section.tables[0].rows[0][0] == "today"
 
 

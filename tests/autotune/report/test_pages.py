@@ -101,6 +101,14 @@ def test_every_loop_of_a_large_campaign_is_a_square_that_leads_to_its_row(tmp_pa
     assert few.drawing == ""
 
 
+def test_loops_that_were_only_identified_are_not_said_to_be_fine():
+    rows = [Row(loop="TIC1", attention="fine", points=8), Row(loop="TIC2", attention="fine", points=8)]
+    page = campaign_page(CampaignSettings(name="boilers", task="identify"), rows)
+    assert page.verdict == "Of 2 loops, 2 are identified."
+    assert page.sections[0].title == "Identified (2)"
+    assert "Nothing is said of the gains in use" in dict(page.answers)["What to do"]
+
+
 def test_a_campaigns_page_shows_every_loops_plant_and_says_what_to_do(tmp_path):
     figures = plant_figures(TransferFunction(num=(0.8,), den=(90.0, 1.0), delay_s=20.0))
     rows = [
