@@ -71,11 +71,9 @@ def disturbance_h2(loop: OpenLoop) -> float:
     return math.sqrt((integral(f, edges, _TOLERANCE) + tails) / math.pi)
 
 
-def order_at_zero(system: TransferFunction) -> float:
-    """Return p where the response goes as s^p at s = 0: negative for integrators, infinite where there is none."""
+def order_at_zero(system: TransferFunction) -> int:
+    """Return p where the response goes as s^p at s = 0: negative for integrators, positive for differentiators."""
     num, den = np.array(system.num), np.array(system.den)
-    if not num.any():  # the gains of a controller that nobody has set yet
-        return math.inf
     return int(np.flatnonzero(num[::-1])[0] - np.flatnonzero(den[::-1])[0])
 
 

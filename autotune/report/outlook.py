@@ -79,6 +79,7 @@ def outlook_section(
     if not analysis.margins.stable or not math.isfinite(analysis.margins.crossover_rad_s):
         return ()
     plants = fit.draws(DRAWS, np.random.default_rng(0))
+    present = _in_use(present)
     times, load = _times(analysis, present), abs(controller.K)
     designed = _member("designed", fit.plant, plants, controller, times, load)
     family = sorted([designed, *_family(analysis, times, load)], key=lambda member: member.kept.modulus, reverse=True)
@@ -134,6 +135,7 @@ def outlook_sentences(analysis: Analysis, present: PIDController | None = None) 
     fit, controller = analysis.fit, analysis.controller
     if not analysis.margins.stable or not math.isfinite(analysis.margins.crossover_rad_s):
         return ()
+    present = _in_use(present)
     times, load = _times(analysis, present), abs(controller.K)
     designed = _member("designed", fit.plant, (), controller, times, load)
     before = None if present is None else _member("today", fit.plant, (), present, times, load)
@@ -144,6 +146,11 @@ def outlook_sentences(analysis: Analysis, present: PIDController | None = None) 
 
 def _amount(value: float, unit: str) -> str:
     return f"{value:.3g} {unit}".strip()
+
+
+def _in_use(present: PIDController | None) -> PIDController | None:
+    """Return the gains before, None where the device holds none: a gain of zero is what nobody has set."""
+    return None if present is None or present.K == 0.0 else present
 
 
 def _times(analysis: Analysis, present: PIDController | None) -> FloatArray:
@@ -174,7 +181,7 @@ def _member(
 
 def _gain_text(designed: Member, before: Member | None, name: str) -> tuple[str, ...]:
     """Return by how much a load's error is smaller than with those of before, where these hold the plant."""
-    if before is None or before.controller.K == 0.0 or not before.kept.stable:
+    if before is None or not before.kept.stable:
         return ()
     now, then = (float(np.sum(np.abs(one.prediction.y[_SAMPLES:] - 1.0))) for one in (designed, before))
     times = f"{then / now:.2g} times smaller" if then > now else f"{now / then:.2g} times larger"
