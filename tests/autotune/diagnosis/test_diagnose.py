@@ -195,8 +195,14 @@ def test_a_ball_that_lies_on_the_floor_for_a_third_of_the_time_leaves_open_how_i
 
 @pytest.mark.timeout(900)  # three searches with blows, minutes on a busy machine
 def test_what_a_blow_makes_of_the_least_change_is_no_second_effect(shared: Path) -> None:
+    """None of those that act as a force does, or hold y where it is: the others are left out for time."""
     case = shared / "practice_cases" / "case_005"
-    found = diagnose(read_model(case / "model.toml"), [read_recording(case / f"rec{k}.csv") for k in (1, 2)])
+    able = {
+        "plant.hard_stop", "plant.coulomb_friction", "plant.quadratic_drag", "plant.cubic_stiffness",
+        "plant.hysteresis", "plant.resonance", "environment.step_load", "environment.gain_step", "sensor.saturation",
+    }  # fmt: skip
+    recordings = [read_recording(case / f"rec{k}.csv") for k in (1, 2)]
+    found = diagnose(read_model(case / "model.toml"), recordings, without=[n for n in CATALOGUE if n not in able])
     assert [e.name for e in found.effects] == ["plant.hard_stop"]
     assert found.effects[0].parameters["high"].value == pytest.approx(6.8958, abs=0.01)
 
