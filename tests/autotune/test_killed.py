@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
@@ -13,6 +11,7 @@ import numpy as np
 import pytest
 
 from tests.autotune import moments_of_writing
+from tests.forked import call
 from tests.fuzz.moments import CONFIG, inputs
 
 CONTROLLER = 'kind = "pi"\nK = 0.5\nTi_s = 1.0\n'
@@ -78,11 +77,9 @@ def kept(tmp_path: Path, command: list[str], results: tuple[str, ...]) -> list[P
         (work / result).parent.mkdir(exist_ok=True)
         (work / result).write_bytes(OLD)
     replacing = ["--overwrite"] if results else []
-    done = subprocess.run(
-        [sys.executable, moments_of_writing.__file__, str(work), str(snapshots), *command, *replacing],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-2000:]
+    given = [moments_of_writing.__file__, str(work), str(snapshots), *command, *replacing]
+    status, printed = call(moments_of_writing.main, given, work)
+    assert status == 0, printed[-2000:]
     count = len([place for place in snapshots.iterdir() if place.is_dir()])
     return [snapshots / str(number) for number in range(count)]
 

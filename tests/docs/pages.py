@@ -11,7 +11,6 @@ environment: there make says what it would do.
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import re
 import select
@@ -21,13 +20,13 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from autotune.config import Config, validated
 from autotune.entry import main
+from tests.forked import call
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -39,10 +38,6 @@ READ_ONLY = {"text", "{toctree}", "st"}
 STATUS = re.compile(r"\s+# exit status (\d+)$")
 #: a call of the program that needs no shell
 PLAIN = re.compile(r"autotune [^|<>&;*?$`~\\]+")
-#: a process per call, forked from one that has imported what most calls need
-CALLS = multiprocessing.get_context("forkserver")
-NEEDED = ["tests.docs.pages", "autotune.cli", "autotune.diagnosis.diagnose", "autotune.report.page"]
-CALLS.set_forkserver_preload(NEEDED)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -142,26 +137,20 @@ class Reader:
             if command.endswith("&"):
                 self._start(command.removesuffix("&"), printed, where)
                 continue
-            status, output = self._call(command) if PLAIN.fullmatch(command) else self._run(command)
+            if PLAIN.fullmatch(command):
+                status, output = call(main, shlex.split(command, comments=True), self._folder, self._environment)
+            else:
+                status, output = self._run(command)
             assert status == wanted, f"{where}: {command}: exit status {status}\n{output}"
             _compare(printed, output, f"{where}: {command}")
 
-    def _run(self, command: str) -> tuple[int, str]:
+    def _run(self, command: str) -> tuple[int | None, str]:
         """Return the exit status of a command of the shell, and what it prints."""
         done = subprocess.run(
             ["bash", "-c", command], cwd=self._folder, env=self._environment, capture_output=True, text=True,
             check=False, stdin=subprocess.DEVNULL,
         )  # fmt: skip
         return done.returncode, done.stdout + done.stderr
-
-    def _call(self, command: str) -> tuple[int | None, str]:
-        """Return the same of a call of the program, without the seconds that its imports take."""
-        printed = [self._folder / f".{name}" for name in ("stdout", "stderr")]
-        given = (shlex.split(command, comments=True), self._folder, self._environment, printed)
-        child = CALLS.Process(target=_called, args=given)
-        child.start()
-        child.join()
-        return child.exitcode, "".join(path.read_text(encoding="utf-8") for path in printed)
 
     def _start(self, command: str, printed: list[str], where: str) -> None:
         """Start a command in the background, and go on when it has printed what the page says it does."""
@@ -176,18 +165,6 @@ class Reader:
             assert child.poll() is None and time.monotonic() < until, f"{where}: {command}: {output}"  # noqa: PT018
             if select.select([child.stdout], [], [], 1.0)[0]:
                 output += os.read(child.stdout.fileno(), 65536).decode()
-
-
-def _called(command: Sequence[str], folder: Path, environment: Mapping[str, str], printed: Sequence[Path]) -> None:
-    """Be the program, called in a folder, and end as it ends."""
-    os.environ.clear()
-    os.environ.update(environment)
-    os.chdir(folder)
-    for number, path in enumerate(printed, 1):
-        with path.open("wb") as file:
-            os.dup2(file.fileno(), number)
-    sys.argv = list(command)
-    main()
 
 
 def _commands(content: str) -> list[tuple[str, list[str]]]:
