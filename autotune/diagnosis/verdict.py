@@ -24,6 +24,7 @@ from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import KINDS, STRUCTURES, kind_of
 from autotune.equations.files import AnyModel
 from autotune.errors import InputError
+from autotune.identification.dependence import only_follows
 from autotune.models import Effect
 from autotune.recording import Recording
 
@@ -37,6 +38,12 @@ UNHEEDED = (
     "Nothing is said of what is missing: on rows that were left out, what explains y best errs as much with commands "
     "that stand still there. Look whether the columns are u and y of this model, and record again with commands that "
     "move y."
+)
+#: What is said where effects were found in a loop that its own noise drives, with a model that is not of its plant.
+UNDISTURBED = (
+    "Nothing is said of what is missing: u does nothing but follow y, as a controller does that nobody disturbs, and "
+    "the model hardly follows y, with or without effects. Look whether the columns are u and y of this model, and "
+    "record a set-point or a dither that moves the loop."
 )
 #: The effect that every fit of a chain has as a free number.
 OFFSET = "actuator.offset"
@@ -166,11 +173,20 @@ class Evidence(ABC):
         """Say what is wrong with the columns, where the model then explains the recordings; else nothing."""
 
     def unheeded_commands(self) -> str:
-        """Say that what explains y best follows no command, where an offset or effects were found; else nothing."""
+        """Say that y is not seen to follow commands, where an offset or effects were found; else nothing.
+
+        What explains y best may follow none. And commands may be nothing but what a controller makes of y: y follows
+        them then by that controller's inverse, which effects imitate where the numbers of a model do not reach it. So
+        there either the model without effects follows y, or effects leave the smaller part of it.
+        """
         if self.found is None or not (self.names or self.offset):
             return ""
         best: Judged = rank(self.found.judged)[0]
-        return "" if best.heeds_commands else UNHEEDED
+        if not best.heeds_commands:
+            return UNHEEDED
+        fit = self.quality
+        told = fit.retuned < ASTRAY or fit.extended < self.limits.majority
+        return "" if told or not only_follows(self.recordings) else UNDISTURBED
 
     @abstractmethod
     def handed_out(self, verdict: Verdict) -> tuple[AnyModel, AnyModel]:

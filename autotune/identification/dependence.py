@@ -130,9 +130,28 @@ def require_order(recordings: Sequence[Recording]) -> None:
         raise _swapped(recordings)
 
 
+def only_follows(recordings: Sequence[Recording]) -> bool:
+    """Return whether u does nothing but follow y, as a controller does that nobody disturbs.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        Of one plant, at least one.
+
+    Notes
+    -----
+    Of a linear plant such recordings say nothing: any that is 1/C, delayed, fits about as well as the true one.
+    """
+    found = [recorded_dependence(recording) for recording in recordings]
+    return min(one.forward for one in found) * len(found) >= CHANCE and _in_row(found)
+
+
+def _in_row(found: Sequence[Dependence]) -> bool:
+    return max(abs(one.same_row) for one in found) > _SAME_ROW
+
+
 def _seem_swapped(found: Sequence[Dependence]) -> bool:
-    in_row = max(abs(one.same_row) for one in found) > _SAME_ROW
-    return min(one.backward for one in found) * len(found) < CHANCE and not in_row
+    return min(one.backward for one in found) * len(found) < CHANCE and not _in_row(found)
 
 
 def _swapped(recordings: Sequence[Recording]) -> IdentificationError:
@@ -170,10 +189,9 @@ def require_answer(recordings: Sequence[Recording]) -> None:
     if min(one.forward for one in found) * len(found) < CHANCE or any(map(_answers_a_test, moving, found)):
         return
     where = ", ".join(recording.name for recording in recordings)
-    in_row = max(abs(one.same_row) for one in found) > _SAME_ROW
     if _seem_swapped(found):
         raise _swapped(recordings)
-    if in_row:
+    if _in_row(found):
         raise IdentificationError(
             "u does nothing but follow y, as a controller does that nobody disturbs: this says nothing of the plant, "
             "unless u and y are swapped",

@@ -78,6 +78,13 @@ def test_nothing_is_said_of_two_walks(seed: int) -> None:
     assert (result.extended_model.blocks, result.extended_model.effects) == (NOMINAL.blocks, ())
 
 
+def test_nothing_is_said_of_a_plant_that_its_controller_alone_moves() -> None:
+    """A PI loop that coloured noise drives: a bend of the command made the model into the controller's inverse."""
+    result = diagnose(NOMINAL, [surrogate("linear loop", 79)])
+    assert (result.verdict, result.effects, result.candidates) == ("unexplained", (), ())
+    assert "u does nothing but follow y" in result.sentences[0]
+
+
 def test_a_sign_is_reversed_though_an_effect_explains_as_much() -> None:
     """Both are judged on the same stretches: an error on half the windows is larger than on an eighth of the rows."""
     result = diagnose(NOMINAL, [surrogate("wrong sign", 9)])
