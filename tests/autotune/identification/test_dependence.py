@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 import autotune as at
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.dependence import dependence, recorded_dependence, require_answer
+from autotune.identification.dependence import dependence, only_follows, recorded_dependence, require_answer
 from autotune.recording import Recording
 
 ROWS = 800
@@ -87,12 +87,14 @@ def test_a_loop_that_only_its_own_noise_drives_says_nothing_of_the_plant() -> No
     for seed in range(10):
         with pytest.raises(IdentificationError, match="u does nothing but follow y"):
             require_answer([closed_loop(seed, setpoint=False)])
+        assert only_follows([closed_loop(seed, setpoint=False)])
 
 
 def test_a_loop_whose_setpoint_moves_answers() -> None:
     loop = closed_loop(1, setpoint=True)
     require_answer([loop])
     assert recorded_dependence(loop).answers
+    assert not only_follows([loop])
 
 
 def test_what_the_columns_say_instead_is_said() -> None:
