@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 OUT ?= runs/ball_sim
 
-.PHONY: run test lint types imports unit fuzz moments bench docs figures dist bom lock audit clean
+.PHONY: run test lint types imports unit fuzz moments bench docs figures dist release bom lock audit clean
 
 run: $(VENV)/.run
 	rm -rf $(OUT)
@@ -51,6 +51,9 @@ figures: $(VENV)/.docs
 
 dist:
 	.ci/dist
+
+release:
+	.ci/release
 
 # Everything is installed from the lock files, which name every version and the hashes of its files; pip's own
 # configuration says where packages come from. make lock writes them anew where pyproject.toml asks for other packages.
