@@ -123,7 +123,7 @@ def require_order(recordings: Sequence[Recording]) -> None:
     -----
     Weaker than :func:`require_answer`: a loop that nothing but its own noise drives passes.
     """
-    moving = [recording for recording in recordings if not _is_constant(_bridge(recording.u))]
+    moving = _moving(recordings)
     found = [recorded_dependence(recording) for recording in moving]
     answers = any(one.answers for one in found) or any(map(_answers_a_test, moving, found))
     if found and not answers and _seem_swapped(found):
@@ -142,8 +142,19 @@ def only_follows(recordings: Sequence[Recording]) -> bool:
     -----
     Of a linear plant such recordings say nothing: any that is 1/C, delayed, fits about as well as the true one.
     """
-    found = [recorded_dependence(recording) for recording in recordings]
-    return min(one.forward for one in found) * len(found) >= CHANCE and _in_row(found)
+    moving = _moving(recordings)
+    found = [recorded_dependence(recording) for recording in moving]
+    return bool(found) and not _answer(moving, found) and _in_row(found)
+
+
+def _moving(recordings: Sequence[Recording]) -> list[Recording]:
+    """Return the recordings whose u moves."""
+    return [recording for recording in recordings if not _is_constant(_bridge(recording.u))]
+
+
+def _answer(moving: Sequence[Recording], found: Sequence[Dependence]) -> bool:
+    """Return whether y answers u in one of the recordings, beyond what chance finds in so many."""
+    return min(one.forward for one in found) * len(found) < CHANCE or any(map(_answers_a_test, moving, found))
 
 
 def _in_row(found: Sequence[Dependence]) -> bool:
@@ -176,7 +187,7 @@ def require_answer(recordings: Sequence[Recording]) -> None:
         u never changes, y is a copy of u, the two are swapped, u does nothing but follow y, or y does not answer u
         beyond chance (1 in 1,000).
     """
-    moving = [recording for recording in recordings if not _is_constant(_bridge(recording.u))]
+    moving = _moving(recordings)
     if not moving:
         raise IdentificationError(
             "u is constant: the command never changes",
@@ -186,7 +197,7 @@ def require_answer(recordings: Sequence[Recording]) -> None:
     for recording in moving:
         _require_two_signals(recording)
     found = [recorded_dependence(recording) for recording in moving]
-    if min(one.forward for one in found) * len(found) < CHANCE or any(map(_answers_a_test, moving, found)):
+    if _answer(moving, found):
         return
     where = ", ".join(recording.name for recording in recordings)
     if _seem_swapped(found):

@@ -306,7 +306,7 @@ def _bases(
 
 
 def _refuse_unasked() -> Design:
-    """Raise what stands in place of a design on a recording's few points: it takes a third of all the time."""
+    """Refuse a design on a recording's few points that nobody asked for: it takes a third of all the time."""
     raise DesignError("not designed on beside the fitted plant: --source points does", where="points")
 
 
