@@ -48,10 +48,9 @@ class SampledPlant:
 
     def thinned(self, step: int) -> SampledPlant:
         """Return the plant at every ``step``-th frequency, for a coarse look."""
-        kept = slice(None, None, step)
         weights = np.add.reduceat(self.weights * self.omega**2, np.arange(0, len(self.omega), step))
-        omega = self.omega[kept]
-        return SampledPlant(omega=omega, h=self.h[kept], weights=weights / omega**2, turn=self.turn, sign=self.sign)
+        omega, h = self.omega[::step].copy(), self.h[::step].copy()  # strided arrays would have their own kernels
+        return SampledPlant(omega=omega, h=h, weights=weights / omega**2, turn=self.turn, sign=self.sign)
 
     @property
     def phase(self) -> FloatArray:

@@ -58,13 +58,18 @@ def transitions(a: FloatArray, durations: FloatArray) -> FloatArray:
     matrix[2 * n, 2 * n + 1] = 1.0
     width = 2 * n + 4
     series = np.empty((_TERMS + 1, n * width))
-    power = np.eye(m)
+    power = np.zeros((m, m))  # as `numpy.eye` and `numpy.outer` have it, which are slow to compile
+    for i in range(m):
+        power[i, i] = 1.0
     for term in range(_TERMS + 1):
         blocks = _blocks(power, n)
         for q in range(n * width):
             series[term, q] = blocks[q // width, q % width]
         power = power @ matrix / (term + 1)
-    unscaled = _blocks(np.outer(scale, 1.0 / scale), n)
+    for i in range(m):
+        for j in range(m):
+            matrix[i, j] = scale[i] * (1.0 / scale[j])
+    unscaled = _blocks(matrix, n)
     result = np.empty((durations.size, n, width))
     entries = np.empty(n * width)
     for c in range(durations.size):

@@ -7,14 +7,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from autotune.arrays import FloatArray
-from autotune.identification.delay.compiled import transitions
 
 _OVERFLOW = 1e100
 _NEGLIGIBLE = 1e-150
 BLOCK = 2048  # pieces that are carried at once
 
 
-@njit(cache=True, nogil=True)
 def begin(
     tu: FloatArray, ty: FloatArray, a: tuple[float, ...], h: float, theta: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -34,16 +32,23 @@ def begin(
         b_0, d, the initial state, b_1..b_m.
     """
     n = len(a)
-    coefficients, chains = np.empty(n), np.zeros((n, n + 6))
-    for i in range(n):
-        coefficients[i], chains[i, 2 + i], chains[i, 3 + n] = a[i], 1.0, theta[2 + i]
-    return coefficients, chains, np.array([ty[0], np.searchsorted(tu, ty[0] - h, side="right") - 1, 0.0])
+    chains = np.zeros((n, n + 6))
+    np.fill_diagonal(chains[:, 2:], 1.0)
+    chains[:, 3 + n] = theta[2 : 2 + n]
+    return np.array(a), chains, np.array([ty[0], np.searchsorted(tu, ty[0] - h, side="right") - 1, 0.0])
 
 
 @njit(cache=True, nogil=True)
 def schedule(
-    tu: FloatArray, u: FloatArray, before: float, linear: bool, ty: FloatArray, h: float, clock: FloatArray
-) -> tuple[FloatArray, int, int]:
+    tu: FloatArray,
+    u: FloatArray,
+    before: float,
+    linear: bool,
+    ty: FloatArray,
+    h: float,
+    clock: FloatArray,
+    resolution: float,
+) -> tuple[FloatArray, int, FloatArray, NDArray[np.int64]]:
     """Cut the time from the clock on into pieces, up to a block of them.
 
     Parameters
@@ -59,14 +64,20 @@ def schedule(
     h : float
         Delay [s].
     clock : (3,) array
-        Time [s], row of the delayed input, next output; changed in place.
+        Time [s], row of the delayed input, next output; moves on in place.
+    resolution : float
+        Durations that differ by less than this share of the time at the block's end are one.
 
     Returns
     -------
     pieces : (BLOCK, 4) array
         Duration, input and its slope at the piece's beginning, and 1 where an output stands at its end.
-    count, outputs : int
-        Pieces and outputs among them. The clock (time, row of the delayed input, next output) has moved on.
+    outputs : int
+        How many outputs stand in the block.
+    durations : (distinct,) array
+        The distinct durations [s].
+    which : (count,) array
+        Which of them each piece has; as many pieces as there are count.
     """
     pieces = np.empty((BLOCK, 4))
     now = clock[0]
@@ -99,26 +110,13 @@ def schedule(
     clock[0] = now
     clock[1] = j
     clock[2] = k
-    return pieces, count, k - first
+    durations, which = _distinct(pieces, count, resolution * abs(now))
+    return pieces, k - first, durations, which
 
 
 @njit(cache=True, nogil=True)
-def piece_transitions(
-    a: FloatArray, pieces: FloatArray, count: int, resolution: float
-) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Return the blocks of the distinct transitions among the pieces, and which of them each piece has.
-
-    Parameters
-    ----------
-    a : (n,) array
-        Coefficients a_0..a_{n-1}.
-    pieces : (BLOCK, 4) array
-        From :func:`schedule`.
-    count : int
-        How many of them there are.
-    resolution : float
-        Durations that differ by less are one [s].
-    """
+def _distinct(pieces: FloatArray, count: int, resolution: float) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Return the distinct durations among the pieces, and which of them each piece has."""
     which = np.empty(count, dtype=np.int64)
     known = np.empty(count)
     found = 0
@@ -132,7 +130,7 @@ def piece_transitions(
             which[i] = found
             known[found] = pieces[i, 0]
             found += 1
-    return transitions(a, known[:found]), which
+    return known[:found], which
 
 
 @njit(cache=True, nogil=True)
@@ -151,8 +149,10 @@ def propagate(
     ----------
     a : tuple of n floats
         Coefficients a_0..a_{n-1}.
-    F, which : arrays
-        From :func:`piece_transitions`.
+    F : (distinct, n, 2n+4) array
+        Transitions over the distinct durations.
+    which : (count,) array
+        From :func:`schedule`.
     pieces : (BLOCK, 4) array
         From :func:`schedule`.
     zeros : int
@@ -218,8 +218,10 @@ def propagate_sensitivities(
         Coefficients a_0..a_{n-1}.
     theta : (2+n+m,) array
         b_0, d, the initial state, b_1..b_m.
-    F, which : arrays
-        From :func:`piece_transitions`.
+    F : (distinct, n, 2n+4) array
+        Transitions over the distinct durations.
+    which : (count,) array
+        From :func:`schedule`.
     pieces : (BLOCK, 4) array
         From :func:`schedule`.
     carried : (n, n+6) array

@@ -10,7 +10,8 @@ rest, s^(n) = sum a_i s^(i) + x: up to a free response, dx/da_i = s^(i) and dx/d
 the covariance of the initial state only.
 
 The coefficients are passed as a tuple: its length is the order, and known to the compiler, which unrolls the loops
-over the states (ten times faster than with an array).
+over the states (ten times faster than with an array). Only what has such loops is compiled for every order; the loop
+over the blocks is Python's, as a compiled one would contain, and compile, all of the rest again for every order.
 """
 
 from __future__ import annotations
@@ -19,18 +20,18 @@ import numpy as np
 from numba import njit
 
 from autotune.arrays import FloatArray
-from autotune.identification.delay.compiled import cholesky_solve
+from autotune.identification.delay.compiled import cholesky_solve, transitions
 from autotune.identification.delay.propagation import (
     BLOCK,
     begin,
-    piece_transitions,
     propagate,
     propagate_sensitivities,
     schedule,
 )
 
+_RESOLUTION = 1e-13  # of the time: durations that differ by less are rounding's
 
-@njit(cache=True, nogil=True)
+
 def normal_matrix(
     tu: FloatArray,
     u: FloatArray,
@@ -88,25 +89,39 @@ def normal_matrix(
     white = np.empty((BLOCK, width))
     first = 0
     while first < ty.size:
-        pieces, count, outputs = schedule(tu, u, before, linear, ty, h, clock)
-        F, which = piece_transitions(coefficients, pieces, count, 1e-13 * abs(clock[0]))
-        finite = propagate(a, F, which, pieces, m, chains, rows[order:])
-        if not finite:
+        pieces, outputs, durations, which = schedule(tu, u, before, linear, ty, h, clock, _RESOLUTION)
+        F = transitions(coefficients, durations)
+        if not propagate(a, F, which, pieces, m, chains, rows[order:]):
             return gram, False
         if sensitive:
             propagate_sensitivities(a, theta, F, which, pieces, chains, rows[order:])
-        for k in range(outputs):
-            rows[order + k, width - 1] = y[first + k] - (rows[order + k, width - 1] if sensitive else 0.0)
         skip = max(0, min(order - first, outputs))
-        if order > 0:
-            _filter(rows, whitening, skip, outputs, white)
-        used = white[skip:outputs] if order > 0 else rows[:outputs]
-        gram += used.T @ used
-        for i in range(order):
-            for c in range(width):
-                rows[i, c] = rows[outputs + i, c]
+        _add_rows(gram, rows, white, y[first : first + outputs], skip, whitening, sensitive)
         first += outputs
     return gram, bool(np.all(np.isfinite(gram)))
+
+
+@njit(cache=True, nogil=True)
+def _add_rows(
+    gram: FloatArray,
+    rows: FloatArray,
+    white: FloatArray,
+    y: FloatArray,
+    skip: int,
+    whitening: FloatArray,
+    sensitive: bool,
+) -> None:
+    """Add a block's rows, filtered and but for those to skip, to the Gram matrix; keep what the next block filters."""
+    order, outputs, width = whitening.size, y.size, rows.shape[1]
+    for k in range(outputs):
+        rows[order + k, width - 1] = y[k] - (rows[order + k, width - 1] if sensitive else 0.0)
+    if order > 0:
+        _filter(rows, whitening, skip, outputs, white)
+    used = white[skip:outputs] if order > 0 else rows[:outputs]
+    gram += used.T @ used
+    for i in range(order):
+        for c in range(width):
+            rows[i, c] = rows[outputs + i, c]
 
 
 @njit(cache=True, nogil=True)
@@ -120,7 +135,6 @@ def _filter(rows: FloatArray, whitening: FloatArray, skip: int, count: int, whit
             white[k, c] = total
 
 
-@njit(cache=True, nogil=True)
 def output(
     tu: FloatArray,
     u: FloatArray,
@@ -156,20 +170,15 @@ def output(
     rows = np.zeros((BLOCK, theta.size))
     first = 0
     while first < ty.size:
-        pieces, count, outputs = schedule(tu, u, before, linear, ty, h, clock)
-        F, which = piece_transitions(coefficients, pieces, count, 1e-13 * abs(clock[0]))
+        pieces, outputs, durations, which = schedule(tu, u, before, linear, ty, h, clock, _RESOLUTION)
+        F = transitions(coefficients, durations)
         if not propagate(a, F, which, pieces, theta.size - 2 - n, chains, rows):
             break
-        for k in range(outputs):
-            total = 0.0
-            for c in range(theta.size):
-                total += rows[k, c] * theta[c]
-            x[first + k] = total
+        x[first : first + outputs] = sum(rows[:outputs, c] * theta[c] for c in range(theta.size))
         first += outputs
     return x
 
 
-@njit(cache=True, nogil=True)
 def sensitivities(
     tu: FloatArray,
     u: FloatArray,
@@ -204,8 +213,8 @@ def sensitivities(
     coefficients, chains, clock = begin(tu, ty, a, h, theta)
     first = 0
     while first < ty.size:
-        pieces, count, outputs = schedule(tu, u, before, linear, ty, h, clock)
-        F, which = piece_transitions(coefficients, pieces, count, 1e-13 * abs(clock[0]))
+        pieces, outputs, durations, which = schedule(tu, u, before, linear, ty, h, clock, _RESOLUTION)
+        F = transitions(coefficients, durations)
         if not propagate(a, F, which, pieces, m, chains, columns[first:]):
             break
         propagate_sensitivities(a, theta, F, which, pieces, chains, columns[first:])
@@ -254,7 +263,6 @@ def linear_part(
     tuple
         The (2+n+m,) theta, and the sum of squares [y unit^2].
     """
-    # not compiled itself: :func:`normal_matrix` would be compiled for every order a second time, as a part of it
     theta = np.zeros(2 + len(a) + zeros)
     gram, finite = normal_matrix(tu, u, before, linear, ty, y, a, h, theta, False, whitening)
     cost = _least_squares(gram, offset, theta) if finite else np.inf

@@ -11,12 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
 
-from autotune.arrays import BoolArray, FloatArray
+from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.delay.data import DelayData
+from autotune.identification.delay.instruments import solve_shapes, stabilise
 from autotune.identification.delay.modulating import SinePower
 from autotune.identification.delay.output_error import Point, Structure, minimise, solve_linear
 
@@ -262,80 +261,14 @@ def _modulated(
     Y = y_windows[starts] @ kernels.T
     U = u_windows @ kernels.T
     shifts = np.arange(0, int(max_delay_s / grid.dt) + 1, stride)
-    a, valid = _instrumental(
+    a, valid = solve_shapes(
         Y, U, starts, shifts, data.before is None, structure.integrator, structure.offset, kernels[0].sum()
     )
     return [
-        (float(shift * grid.dt), tuple(float(value) for value in _stabilise(row, data.duration_s)))
+        (float(shift * grid.dt), tuple(float(value) for value in stabilise(row, data.duration_s)))
         for shift, row, good in zip(shifts, a, valid, strict=True)
         if good
     ]
-
-
-@njit(cache=True)
-def _instrumental(
-    Y: FloatArray,
-    U: FloatArray,
-    starts: NDArray[np.int64],
-    shifts: NDArray[np.int64],
-    past_unknown: bool,
-    integrator: bool,
-    offset: bool,
-    area: float,
-) -> tuple[FloatArray, BoolArray]:
-    """Return a for every shift: unknowns a_0.., b, d; instruments the modulated input's derivatives and 1."""
-    n = Y.shape[1] - 1
-    lowest = 1 if integrator else 0
-    p = n - lowest + 1 + (1 if offset else 0)
-    a = np.zeros((shifts.size, n))
-    valid = np.zeros(shifts.size, dtype=np.bool_)
-    scale_y = np.sqrt(np.sum(Y * Y, axis=0)) + 1e-300
-    scale_u = np.sqrt(np.sum(U * U, axis=0)) + 1e-300
-    for q in range(shifts.size):
-        M = np.zeros((p, p))
-        g = np.zeros(p)
-        z = np.full(p, area)
-        r = np.full(p, area)
-        rows = 0
-        for k in range(starts.size):
-            at = starts[k] - shifts[q]
-            if past_unknown and at < 0:
-                continue
-            at = max(at, 0)
-            rows += 1
-            for i in range(n - lowest):
-                r[i] = (-1.0) ** (i + lowest) * Y[k, i + lowest] / scale_y[i + lowest]
-                z[i] = U[at, i + 1] / scale_u[i + 1]
-            r[n - lowest] = U[at, 0] / scale_u[0]
-            z[n - lowest] = U[at, 0] / scale_u[0]
-            for i in range(p):
-                g[i] += z[i] * (-1.0) ** n * Y[k, n]
-                for j in range(p):
-                    M[i, j] += z[i] * r[j]
-        if rows < 2 * n + 4 or not np.all(np.isfinite(M)) or np.linalg.cond(M) > 1e12:
-            continue
-        solution = np.linalg.solve(M, g)
-        for i in range(lowest, n):
-            a[q, i] = solution[i - lowest] / scale_y[i]
-        valid[q] = np.all(np.isfinite(a[q]))
-    return a, valid
-
-
-@njit(cache=True)
-def _stabilise(a: FloatArray, duration_s: float) -> FloatArray:
-    """Mirror poles that would grow by more than a factor e over the record into the left half plane."""
-    n = a.size
-    if n <= 2 and np.all(a <= 0.0):
-        return a
-    polynomial = np.ones(n + 1, dtype=np.complex128)
-    polynomial[1:] = -a[::-1]
-    product = np.zeros(n + 1, dtype=np.complex128)  # descending powers of prod(s - root)
-    product[0] = 1.0
-    for root in np.roots(polynomial):
-        kept = -np.conj(root) if root.real > 1.0 / duration_s else root
-        for q in range(n, 0, -1):
-            product[q] -= kept * product[q - 1]
-    return -product.real[:0:-1]
 
 
 def _local_minima(points: list[Point]) -> list[Point]:

@@ -69,11 +69,10 @@ def _residual(
     return out, K
 
 
-@njit(cache=True)
 def _fit(
     start: FloatArray, limit: FloatArray, omega: FloatArray, G: ComplexArray, weight: FloatArray
 ) -> tuple[FloatArray, float, float]:
-    """Levenberg-Marquardt on the three logarithms."""
+    """Levenberg-Marquardt on the three logarithms; not compiled, which would take longer than all its fits."""
     theta = start.copy()
     error, K = _residual(theta, start, limit, omega, G, weight)
     cost = np.dot(error, error)
