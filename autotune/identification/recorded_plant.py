@@ -17,6 +17,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from autotune.arrays import FloatArray
+from autotune.distributions import chi2_tail
 from autotune.errors import AutotuneError, IdentificationError
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
@@ -24,6 +25,7 @@ from autotune.identification.dependence import is_fed_back
 from autotune.identification.equation_region import LEAST_SHARE, Equation, joined, largest_term
 from autotune.identification.parametric import EXCLUDED, PlantFit, not_excluded
 from autotune.models import TransferFunction
+from autotune.points import FrequencyPoint
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
@@ -32,6 +34,8 @@ _ORDERS = (1, 2, 3)
 _FIRST_ZERO = 0.1
 _ZEROS = (0.25, 0.5, 1.0, 2.0)
 _ZERO_STEPS = 12
+#: probability of what points of the same plant are off a fit, below which they contradict it; draws of the fit for it
+_CONTRADICTED, _DRAWS = 1e-4, 200
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +64,9 @@ class _Fitted:
         return likelihood + self.coefficients * math.log(sum(rows))
 
 
-def fit_recordings(recordings: Sequence[Recording], progress: Progress = quiet) -> PlantFit:
+def fit_recordings(
+    recordings: Sequence[Recording], progress: Progress = quiet, unbiased: Sequence[FrequencyPoint] = ()
+) -> PlantFit:
     """Fit the differential equation with dead time that the recordings determine, with its region.
 
     Parameters
@@ -69,6 +75,8 @@ def fit_recordings(recordings: Sequence[Recording], progress: Progress = quiet) 
         Of one plant, with a command that moves; what was measured with feedback needs a delay in the loop.
     progress : Progress
         Told which structure is being fitted.
+    unbiased : sequence of FrequencyPoint
+        Of the same plant, of a kind that feedback does not bias: a structure that they contradict is left out.
 
     Returns
     -------
@@ -79,12 +87,13 @@ def fit_recordings(recordings: Sequence[Recording], progress: Progress = quiet) 
     Raises
     ------
     IdentificationError
-        No structure is determined by the recordings; the reason is that of the simplest.
+        No structure is determined by the recordings; the reason is that of the simplest. Or points contradict all.
 
     Notes
     -----
     Resonances are in the class, and in open loop one zero of a plant of order 2 (inverse response, overshoot); under
-    feedback a zero would take up what the noise model leaves of the load that the controller answers.
+    feedback a zero would take up what the noise model leaves of the load that the controller answers. There the inverse
+    of the controller, delayed, may fit best as well, as what the noise does comes back by it.
     """
     found: list[_Fitted] = []
     reason: AutotuneError | None = None
@@ -108,7 +117,29 @@ def fit_recordings(recordings: Sequence[Recording], progress: Progress = quiet) 
     if not any(is_fed_back(one) for one in recordings):
         found += [zero for one in found if one.structure.order == 2 and (zero := _zero(recordings, one)) is not None]
     rows = [min(one.models[i].rows for one in found) for i in range(len(recordings))]
-    return not_excluded([_with_zero(recordings, one, rows) if one.tau_s else _join(one, rows) for one in found])
+    fits = [_with_zero(recordings, one, rows) if one.tau_s else _join(one, rows) for one in found]
+    agreeing = [fit for fit in fits if _agrees(fit, unbiased)]
+    if not agreeing:
+        raise IdentificationError(
+            "what y does after u is not what it does after the set-point, with any structure",
+            where=recordings[0].name,
+            remedy="move the set-point more, or record the plant with the controller off",
+        )
+    return not_excluded(agreeing)
+
+
+def _agrees(fit: PlantFit, points: Sequence[FrequencyPoint]) -> bool:
+    """Whether points do not contradict a fit, by the covariance of both (Hausman's test, with the two independent)."""
+    if not points:
+        return True
+    omega = np.array([point.omega_rad_s for point in points])
+    drawn = np.array([plant.response(omega) for plant in fit.draws(_DRAWS, np.random.default_rng(0))])
+    errors = np.array([point.response for point in points]) - fit.plant.response(omega)
+    distance = 0.0
+    for point, error, of_fit in zip(points, errors, drawn.T, strict=True):
+        e = np.array([error.real, error.imag])
+        distance += float(e @ np.linalg.solve(np.array(point.covariance) + np.cov([of_fit.real, of_fit.imag]), e))
+    return chi2_tail(distance, 2 * len(points)) >= _CONTRADICTED
 
 
 def _leading(recording: Recording, tau_s: float) -> Recording:

@@ -87,7 +87,8 @@ def measured_of(
     few = fit is None and combined is not None and len(combined.points) < _LEAST_POINTS
     if recordings and not given and (few or all(one.excitation in _PLAIN for one in estimates)):
         try:
-            fit = fit_recordings([_from_first_cycle(one) for one in recordings], progress)
+            by_way_of_r = [one for one in combined.points if one.source == "closed loop"] if combined else []
+            fit = fit_recordings([_from_first_cycle(one) for one in recordings], progress, by_way_of_r)
         except AutotuneError as error:
             notes.append(str(error))
             reason = reason or error

@@ -19,7 +19,7 @@ from autotune.identification.recorded_plant import fit_recordings
 from autotune.models import TransferFunction
 from autotune.pipeline import analyse, measured_of
 from autotune.recording import Recording
-from tests.benchmarks._front_door_files import BOILER, DOORS, OVEN, Rows, levels, open_loop
+from tests.benchmarks._front_door_files import BOILER, DOORS, EXCHANGER, OVEN, Rows, closed_loop, levels, open_loop
 from tests.benchmarks.front_door import best, load_error, tuned
 
 FILES = {door.name: door for door in DOORS}
@@ -124,3 +124,14 @@ def test_noise_under_one_step_is_still_refused(seed: int) -> None:
     y = np.cumsum(rng.standard_normal(u.size))
     with pytest.raises(IdentificationError, match="beyond chance"):
         require_answer([Recording(t=np.arange(u.size, dtype=np.float64), u=u, y=y, name="walk")])
+
+
+@pytest.mark.parametrize("seed", [4, 23])
+def test_the_inverse_of_the_controller_is_not_taken_for_the_plant(seed: int) -> None:
+    """With seed 23 it fits the rows best; the points by way of the set-point are 20 standard deviations from it."""
+    r = levels(1.0, (100.0, 0.0), (400.0, 5.0), (400.0, -2.0), (300.0, 3.0))
+    rows = closed_loop(EXCHANGER, r, 1.0, 0.4, 60.0, 0.1, 50.0, 40.0, seed)
+    fit = measured_of([Recording(t=rows.t, u=rows.u, y=rows.y, extra={"r": rows.r}, name="loop")]).fit
+    assert fit is not None
+    omega = np.array([0.03])  # below the crossover, at .046 rad/s
+    np.testing.assert_allclose(fit.plant.response(omega), EXCHANGER.response(omega), rtol=0.15)

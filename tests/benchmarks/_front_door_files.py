@@ -78,7 +78,7 @@ def open_loop(
     return Rows(t=step_s * np.arange(u.size), u=u_0 + u, y=y)
 
 
-def _closed(
+def closed_loop(
     plant: TransferFunction, r: FloatArray, step_s: float, K: float, Ti: float, noise: float, y_0: float, u_0: float,
     seed: int,
 ) -> Rows:  # fmt: skip
@@ -117,7 +117,7 @@ def _staircase() -> Rows:
 
 def _loop() -> Rows:
     r = levels(1.0, (100.0, 0.0), (400.0, 5.0), (400.0, -2.0), (300.0, 3.0))
-    return _closed(EXCHANGER, r, 1.0, 0.4, 60.0, 0.1, 50.0, 40.0, 4)
+    return closed_loop(EXCHANGER, r, 1.0, 0.4, 60.0, 0.1, 50.0, 40.0, 4)
 
 
 def _historian() -> Rows:
@@ -127,7 +127,7 @@ def _historian() -> Rows:
 
 def _pid_block() -> Rows:
     r = levels(0.5, (60.0, 0.0), (240.0, 6.0), (240.0, -3.0), (240.0, 4.0))
-    return _closed(EXCHANGER, r, 0.5, 0.5, 50.0, 0.08, 50.0, 40.0, 6)
+    return closed_loop(EXCHANGER, r, 0.5, 0.5, 50.0, 0.08, 50.0, 40.0, 6)
 
 
 def _inverse() -> Rows:
