@@ -89,7 +89,6 @@ class Thresholds:
     rig_starts: int = known(2, "starting points", "of an effect that are fitted", "cost")
     rig_pruned: int = known(4, "hypotheses", "leading, of which each effect is left out once more", "cost")
     rig_tried: int = known(8, "effects", "beside one hypothesis that are fitted, and of the fits those that are judged on left-out stretches", "cost")
-    usual: float = known(0.15, "prior odds", "from which on an effect is always fitted", "convention")
     out_of_phase: float = known(0.3, "of the spread", "held-out error from which on a free run may be out of phase", "convention")
     # equations: any model, judged as it runs freely through windows of a third of a recording
     equation_astray: float = known(2.0, "times the noise", "variance from which on fits begin anew from short windows", "cost")

@@ -19,6 +19,7 @@ from autotune.effects.base import (
     Scan,
     SignalSizes,
     ends,
+    lacking,
 )
 from autotune.effects.converter import converter_steps
 from autotune.effects.in_equations import Around, InEquations, Tried, curves
@@ -239,7 +240,7 @@ ACTUATOR = (
         memory=Memory(name="held", replayed=True),
         starts=lambda s: [(c * s.w,) for c in (0.05, 0.2, 0.5)],
         rough=True,
-        odds={"any": 0.05, "shaft": 0.1, "carriage": 0.03, "lifted": 0.01, "arm": 0.01, "valve": 0.7, "process": 0.2},
+        odds=lacking(expected="valve", usual="shaft process", possible="any", rare="lifted arm"),
         in_equations=InEquations(
             acts="held",
             samples="play",
@@ -262,7 +263,7 @@ ACTUATOR = (
         lasting=True,
         rough=True,
         includes=("actuator.backlash",),  # with a slip of 0 it is play
-        odds={"valve": 0.4, "process": 0.15},
+        odds=lacking(expected="valve", usual="process"),
         in_equations=InEquations(
             acts="held",
             samples="stick",
@@ -279,7 +280,7 @@ ACTUATOR = (
         lines=(Line(stage="command", does=_without_zone),),
         starts=lambda s: [(c * s.w,) for c in (0.01, 0.04, 0.12, 0.3)],
         rough=True,
-        odds={"any": 0.15, "level": 0.1, "thermal": 0.05, "valve": 0.1, "damper": 0.0},
+        odds=lacking(usual="any", possible="thermal", rare="damper"),
         in_equations=InEquations(
             acts="input",
             text="value - min(max(value, -half_width), half_width)",
@@ -300,7 +301,7 @@ ACTUATOR = (
         lines=(Line(stage="command", does=curved),),
         goes_on=rises,
         starts=lambda s: [(0.05 / s.w, 1e-3 / s.w**2), (1e-3 / s.w, 0.05 / s.w**2)],
-        odds={"any": 0.1, "arm": 0.5, "speed": 0.15, "carriage": 0.03, "thermal": 0.05, "shaft": 0.05, "valve": 0.05},
+        odds=lacking(usual="any", possible="carriage thermal shaft valve"),
         in_equations=InEquations(
             acts="input",
             text="value + second_order*(value - origin)^2 + third_order*(value - origin)^3",
@@ -321,7 +322,7 @@ ACTUATOR = (
         ),
         lines=(Line(stage="command", does=_limited),),
         starts=lambda s: limit_starts(s.w_low, s.w_high, (0.05, 0.15, 0.3)),
-        odds={"any": 0.15, "level": 0.3},
+        odds=lacking(usual="any"),
         in_equations=InEquations(
             acts="input",
             text="min(max(value, low), high)",
@@ -339,7 +340,6 @@ ACTUATOR = (
         memory=Memory(name="before"),
         sub_steps=4,
         starts=lambda s: [(s.w / (c * s.lag_s),) for c in (0.03, 0.06, 0.1, 0.16, 0.25, 0.4, 0.6, 1.0, 1.5)],
-        odds={"any": 0.01, "damper": 0},
         in_equations=InEquations(
             acts="input",
             text="memory",
@@ -358,7 +358,6 @@ ACTUATOR = (
         starts=lambda s: [(0.01 / s.duration_s,)],
         places=("actuator", "plant"),
         at_a_time=True,
-        odds={"any": 0.02, "damper": 0, "arm": 0.005, "oscillator": 0.005},
         in_equations=InEquations(
             acts="input",
             text="value*(1 + rate*t)",
@@ -375,7 +374,7 @@ ACTUATOR = (
         starts=lambda s: [(c * s.lag_s,) for c in (0.05, 0.25)],
         same=("sensor.lag",),
         places=("actuator", "sensor", "plant"),
-        odds={"any": 0.2, "damper": 0.05},
+        odds=lacking(usual="any", possible="damper"),
         in_equations=InEquations(
             acts="input",
             text="memory",
@@ -404,7 +403,6 @@ ACTUATOR = (
         sub_steps=2,
         needs=ACTUATOR_LAG,
         starts=_asymmetric_starts,
-        odds={"any": 0.02, "damper": 0},
         in_equations=InEquations(
             acts="input",
             text="memory",

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import Literal, Protocol, TypeAlias
 
 from autotune.arrays import FloatArray
@@ -35,6 +36,23 @@ Sign: TypeAlias = Literal["positive", "real"]
 Sought: TypeAlias = Literal[
     "equations", "hypothesis", "rig", "structure", "operating point", "samples", "residual", "law"
 ]
+
+#: How usual it is that a model lacks an effect which its rig has.
+Prior: TypeAlias = Literal["expected", "usual", "possible", "rare"]
+#: The same as odds: what is expected is as likely as not, and a fifth from word to word, for nobody knows them better.
+PRIOR_ODDS: Mapping[Prior, float] = MappingProxyType({"expected": 1.0, "usual": 0.2, "possible": 0.04, "rare": 0.008})
+
+
+def lacking(expected: str = "", usual: str = "", possible: str = "", rare: str = "") -> Mapping[str, Prior]:
+    """Return how usual it is that a model lacks an effect, by kind of rig.
+
+    Parameters
+    ----------
+    expected, usual, possible, rare : str
+        Kinds of rigs (:mod:`autotune.effects.rigs`; ``any`` for all others), with spaces between them.
+    """
+    said: dict[Prior, str] = {"expected": expected, "usual": usual, "possible": possible, "rare": rare}
+    return MappingProxyType({rig: word for word, rigs in said.items() for rig in rigs.split()})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -355,8 +373,8 @@ class EffectKind:
         law goes on there beyond what was recorded: it neither turns back nor feeds what it acts on. Its last two
         parameters are then :func:`ends`, marks of an extended model beyond which it adds what it adds there.
     odds : mapping
-        Prior odds that a rig of a kind (:mod:`autotune.effects.rigs`; ``any`` for all others) has it and its
-        model lacks it. They count where model error and not noise decides; without odds it is not considered there.
+        How usual it is that a rig of a kind (:mod:`autotune.effects.rigs`; ``any`` for all others) has it and its
+        model lacks it, in the words of :data:`PRIOR_ODDS`; rare in kinds that are not given.
     """
 
     name: str
@@ -393,7 +411,11 @@ class EffectKind:
     includes: tuple[str, ...] = ()
     places: tuple[str, ...] = ()
     goes_on: Callable[[Values, float], bool] | None = None
-    odds: Mapping[str, float] = field(default_factory=dict, hash=False, compare=False)
+    odds: Mapping[str, Prior] = field(default_factory=dict, hash=False, compare=False)
+
+    def prior_odds(self, rig: str) -> float:
+        """Return the prior odds that a model of a kind of rig lacks it."""
+        return PRIOR_ODDS[self.odds.get(rig, self.odds.get("any", "rare"))]
 
     @property
     def place(self) -> str:

@@ -63,10 +63,7 @@ def _of(kind: EffectKind) -> Iterator[tuple[str, str]]:
         yield "no fit would ever start", "give starts=lambda sizes: [...] or search=..."
     for rig in kind.odds:
         if rig not in (*get_args(RigKind), "any"):
-            yield (
-                f"odds of no kind of rig: {rig!r}",
-                f"kinds are {', '.join(get_args(RigKind))}, any",
-            )
+            yield f"odds of no kind of rig: {rig!r}", f"kinds are {', '.join(get_args(RigKind))}, any"
     if kind.is_simulated:
         yield from _simulated(kind)
     yield from _starts(kind)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from autotune.effects.base import LEVEL, NEVER, EffectKind, Quantity, Scan
+from autotune.effects.base import LEVEL, NEVER, EffectKind, Quantity, Scan, lacking
 from autotune.effects.in_equations import LOADED, Around, InEquations, Tried
 from autotune.effects.stages import Line, Values
 from autotune.models import Parameter
@@ -227,7 +227,6 @@ ENVIRONMENT = (
         acts_in=_acts_in,
         places=_PLACES,
         at_a_time=True,
-        odds={"any": 0.01, "damper": 0.0},
         in_equations=InEquations(
             acts="force",
             text="if(t >= time, if(t < end, amplitude, 0), 0)",
@@ -283,7 +282,7 @@ ENVIRONMENT = (
         same=("sensor.drift",),
         places=_PLACES,
         at_a_time=True,
-        odds={"any": 0.03, "damper": 0},
+        odds=lacking(possible="any", rare="damper"),
         in_equations=InEquations(
             acts="force",
             text="rate*t",
@@ -304,7 +303,7 @@ ENVIRONMENT = (
         acts_in=_acts_in,
         places=_PLACES,
         at_a_time=True,
-        odds={"any": 0.02, "thermal": 0.07, "level": 0.07, "speed": 0.04, "damper": 0.0},
+        odds=lacking(possible="thermal level speed"),
         reference=_ASTROM,
     ),
     EffectKind(
@@ -319,7 +318,7 @@ ENVIRONMENT = (
         acts_in=_acts_in,
         places=_PLACES,
         at_a_time=True,
-        odds={"any": 0.02, "thermal": 0.07, "level": 0.07},
+        odds=lacking(possible="thermal level"),
         reference="Incropera and DeWitt, Fundamentals of Heat and Mass Transfer, ch. 5",
     ),
     EffectKind(

@@ -25,6 +25,7 @@ from autotune.effects.base import (
     Quantity,
     SignalSizes,
     ends,
+    lacking,
 )
 from autotune.effects.in_equations import HEATED, MOVING, STORED, Around, InEquations, Tried
 from autotune.effects.stages import Blocks, Line, LinearPart, Memory, Values
@@ -353,7 +354,7 @@ PLANT = (
         suits=RUBBING,
         starts=_dry_starts,
         rough=True,
-        odds={"arm": 0.7, "shaft": 0.7, "carriage": 0.7, "speed": 0.7, "lifted": 0.1, "oscillator": 0.2, "damper": 1.0},
+        odds=lacking(expected="arm shaft carriage speed damper", usual="lifted oscillator"),
         in_equations=InEquations(
             acts="force",
             text="-level*sign(V)",
@@ -381,7 +382,7 @@ PLANT = (
         stand_in=lambda fitted: fitted.values["breakaway"] <= fitted.values["level"],
         rough=True,
         includes=("plant.coulomb_friction",),
-        odds={"arm": 0.15, "shaft": 0.2, "carriage": 0.2, "speed": 0.2, "lifted": 0.03, "oscillator": 0.05},
+        odds=lacking(usual="arm shaft carriage speed", possible="lifted oscillator"),
         in_equations=InEquations(
             acts="force",
             text="-(level + (breakaway - level)*exp(-(V/stribeck_speed)^2))*sign(V)",
@@ -419,7 +420,7 @@ PLANT = (
         needs=MECHANICAL,
         suits=MECHANICAL,
         starts=lambda s: [(0.05 / s.v,), (0.5 / s.v,)],
-        odds={"arm": 0.15, "shaft": 0.1, "carriage": 0.1, "speed": 0.2, "lifted": 0.1, "oscillator": 0.1},
+        odds=lacking(usual="arm shaft carriage speed lifted oscillator"),
         in_equations=InEquations(
             acts="force",
             text="-coefficient*V*abs(V)",
@@ -438,7 +439,7 @@ PLANT = (
         needs=TRAVEL,
         suits=TRAVEL,
         starts=lambda s: [(0.02 * s.f / s.x**3,), (0.3 * s.f / s.x**3,)],
-        odds={"arm": 0.1, "oscillator": 0.3, "carriage": 0.02, "shaft": 0.02, "lifted": 0.02},
+        odds=lacking(usual="arm oscillator"),
         in_equations=InEquations(
             acts="force",
             text="-coefficient*X^3",
@@ -455,7 +456,7 @@ PLANT = (
         lines=(Line(stage="force", does=weighed),),
         goes_on=lambda values, x: 1.0 + values["slope"] * x > 0.0,
         starts=lambda s: [(0.02 / s.x,), (-0.02 / s.x,)],
-        odds={"lifted": 0.2, "level": 0.02, "carriage": 0.003, "arm": 0.003, "shaft": 0.003},
+        odds=lacking(usual="lifted"),
         in_equations=InEquations(
             acts="input",
             text="value*(1 + slope*X)",
@@ -481,7 +482,7 @@ PLANT = (
         # readings at a stop lie around it: it is beyond all but the farthest
         starts=lambda s: limit_starts(s.y_low, s.y_high, (-0.005, 0.02, 0.1)),
         impacts=True,
-        odds={"lifted": 0.01, "carriage": 0.03, "arm": 0.01, "shaft": 0.01},
+        odds=lacking(possible="carriage"),
         in_equations=InEquations(
             acts="force",
             text="if(X > high, -stiffness*(X - high) - damping*max(V, 0), 0)"
@@ -509,7 +510,7 @@ PLANT = (
         lines=(Line(stage="force", does=outflow), Line(stage="outflow", does=_lower_outflow)),
         suits=LEVEL,
         starts=lambda s: [(c * s.x,) * (2 if s.levels == 2 else 1) for c in (1.5, 6.0)],
-        odds={"level": 1.0},
+        odds=lacking(expected="level"),
         in_equations=InEquations(
             acts="force",
             text="-coefficient*sqrt(max(X, 0))",
@@ -557,7 +558,7 @@ PLANT = (
         rough=True,
         stand_in=_is_friction_or_spring,
         includes=("plant.coulomb_friction",),
-        odds={"valve": 0.05, "carriage": 0.01, "arm": 0.01, "shaft": 0.02, "damper": 0},
+        odds=lacking(possible="valve"),
         in_equations=InEquations(
             acts="force",
             text="-amplitude*memory",
@@ -583,7 +584,7 @@ PLANT = (
         suits=LEVEL,
         possible=_kelvin,
         starts=lambda s: [(c / (s.x_offset + _ICE) ** 3,) for c in (0.02, 0.3)],
-        odds={"thermal": 0.05},
+        odds=lacking(possible="thermal"),
         in_equations=InEquations(
             acts="force",
             text="-coefficient*((X + zero)^4 - surroundings^4)",
@@ -605,7 +606,7 @@ PLANT = (
         sought="rig",
         suits=LEVEL,
         starts=lambda s: [(0.05 / s.x,), (0.5 / s.x,)],
-        odds={"thermal": 0.03},
+        odds=lacking(possible="thermal"),
         in_equations=InEquations(
             acts="force",
             text="-coefficient*V*abs(V)",
@@ -623,7 +624,7 @@ PLANT = (
         goes_on=lambda values, x: values["rate"] > 0.0,
         suits=INTEGRATING,
         starts=lambda s: [(0.02 * abs(s.f * s.gain) / s.x,)],
-        odds={"lifted": 0.3, "carriage": 0.05, "level": 0.3, "process": 0.1},
+        odds=lacking(usual="lifted level thermal process", possible="carriage"),
         in_equations=InEquations(
             acts="force",
             text="-rate*X",
@@ -649,7 +650,7 @@ PLANT = (
         suits=TRAVEL,
         starts=_sine_starts,
         stand_in=_is_slope,
-        odds={"arm": 1.5, "shaft": 0.03, "carriage": 0.01},
+        odds=lacking(expected="arm", possible="shaft"),
         in_equations=InEquations(
             acts="force",
             text="-amplitude*sin(2*pi*X/period + phase)",
@@ -676,7 +677,6 @@ PLANT = (
         suits=LEVEL,
         starts=lambda s: [(0.03, c * s.lag_s) for c in (2.5, 8.0)],
         places=("plant", "sensor"),
-        odds={"thermal": 0.01, "level": 0.005, "process": 0.005},
         in_equations=InEquations(
             acts="reading",
             text="(1 - share)*value + share*memory",

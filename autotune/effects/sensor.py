@@ -6,7 +6,7 @@ import math
 
 from autotune.arrays import FloatArray
 from autotune.effects.actuator import limit_starts, rises
-from autotune.effects.base import NEVER, EffectKind, Quantity, ends
+from autotune.effects.base import NEVER, EffectKind, Quantity, ends, lacking
 from autotune.effects.in_equations import InEquations, Tried, curves
 from autotune.effects.stages import Blocks, Line, LinearPart, Values
 from autotune.models import Block, TransferFunction
@@ -74,7 +74,7 @@ SENSOR = (
         same=("actuator.lag",),
         recoordinates=True,
         places=("sensor", "actuator", "plant"),
-        odds={"any": 0.2, "damper": 0.05},
+        odds=lacking(usual="any", possible="damper"),
         in_equations=InEquations(
             acts="reading",
             text="memory",
@@ -97,7 +97,7 @@ SENSOR = (
         goes_on=rises,
         starts=lambda s: [(0.05 / s.x, 1e-3 / s.x**2), (1e-3 / s.x, 0.05 / s.x**2)],
         recoordinates=True,
-        odds={"any": 0.002, "level": 0.03},
+        odds=lacking(possible="level"),
         in_equations=InEquations(
             acts="reading",
             text="value + second_order*(value - origin)^2 + third_order*(value - origin)^3",
@@ -117,7 +117,6 @@ SENSOR = (
         starts=lambda s: [(0.01 * s.y / s.duration_s,)],
         same=("environment.drifting_load",),
         at_a_time=True,
-        odds={"any": 0.02, "damper": 0},
         in_equations=InEquations(
             acts="reading",
             text="value + rate*t",
@@ -146,7 +145,7 @@ SENSOR = (
         lines=(Line(stage="reading", does=_limited),),
         starts=lambda s: limit_starts(s.y_low, s.y_high, (0.02, 0.1)),
         flattens=True,
-        odds={"any": 0.03, "lifted": 0.01},
+        odds=lacking(possible="any", rare="lifted"),
         in_equations=InEquations(acts="reading", text="min(max(value, low), high)"),
         reference=_LJUNG,
     ),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from autotune.effects.base import EffectKind, Quantity
+from autotune.effects.base import EffectKind, Quantity, lacking
 from autotune.effects.in_equations import InEquations, Tried
 from autotune.effects.stages import Blocks, Line, LinearPart, Values
 from autotune.errors import InputError
@@ -34,7 +34,7 @@ TIMING = (
         linear=LinearPart(blocks=_with_delay),
         starts=lambda s: [(c,) for c in (0.5 * s.dt_s, 2.5 * s.dt_s, 6.0 * s.dt_s, 14.0 * s.dt_s, 0.3 * s.lag_s)],
         places=("timing", "actuator", "sensor"),
-        odds={"any": 0.2, "damper": 0.05},
+        odds=lacking(usual="any", possible="damper"),
         in_equations=InEquations(
             acts="delay",
             trials=lambda a: [Tried({"delay": min(c * a.dt_s, a.slow_s)}) for c in (2.0, 8.0, 30.0)],

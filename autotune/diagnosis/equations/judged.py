@@ -14,13 +14,10 @@ from autotune.diagnosis.equations.candidates import key_of
 from autotune.diagnosis.equations.scores import innovations_variance, is_noise, is_slow, noise_of
 from autotune.diagnosis.fitting.noise import Noise
 from autotune.diagnosis.selection.judged import Judged
-from autotune.diagnosis.selection.probability import RARE
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import kind_of
+from autotune.effects.base import PRIOR_ODDS
 from autotune.models import Effect
-
-#: Prior odds, at most, of an effect that a rig of some kind usually lacks: of what kind equations are is not known.
-MOST = 0.3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,8 +105,12 @@ class JudgedEquations(Judged):
 
 
 def odds_of(effect: Effect) -> float:
-    """Return the prior odds that equations lack an effect: those of the kinds of rigs that usually have it."""
-    return min(max(*kind_of(effect.name).odds.values(), RARE, RARE), MOST)
+    """Return the prior odds that equations lack an effect: of the rigs that lack it most, usual ones at most.
+
+    Of what kind of rig equations are is not known, so that nothing is expected of them.
+    """
+    words = kind_of(effect.name).odds.values()
+    return min(max((PRIOR_ODDS[word] for word in words), default=PRIOR_ODDS["rare"]), PRIOR_ODDS["usual"])
 
 
 def judge(bench: Bench, outcome: Outcome, own: int) -> JudgedEquations | None:

@@ -26,7 +26,6 @@ from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
 from autotune.diagnosis.selection.judged import leading, rank
 from autotune.diagnosis.selection.judged_chain import JudgedChain, at_both_scales
 from autotune.diagnosis.selection.prediction import distinct_starts, extend, predictions, signal_sizes, starting_effects
-from autotune.diagnosis.selection.probability import RARE
 from autotune.diagnosis.selection.refits import fit_without, move_time_of_change
 from autotune.diagnosis.selection.scan import search_starts
 from autotune.diagnosis.selection.search import Found, Proposals, search
@@ -34,7 +33,7 @@ from autotune.diagnosis.simulation.assembly import input_size
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.effects import ALL, taken_by
-from autotune.effects.base import EffectKind, SignalSizes
+from autotune.effects.base import PRIOR_ODDS, EffectKind, SignalSizes
 from autotune.effects.rigs import rig_kind
 from autotune.models import Effect, Model
 from autotune.progress import Progress, quiet
@@ -99,7 +98,7 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
             if base.leaves_noise:
                 found = [s for s in found if s.decrease > PROMISING * _charge(s)]
             found.sort(key=lambda s: -s.decrease - 2.0 * math.log(s.odds))
-            starts += [s for k, s in enumerate(found) if k < self.limits.rig_tried or s.odds >= self.limits.usual]
+            starts += [s for k, s in enumerate(found) if k < self.limits.rig_tried or s.odds >= PRIOR_ODDS["usual"]]
         fits = self.pool.map(lambda s: _fit_added(s, self), starts)
         best: dict[frozenset[str], tuple[Fit, float, JudgedChain]] = {}
         for s, result in zip(starts, fits, strict=True):
@@ -154,7 +153,7 @@ def _odds(
     kind = rig_kind(model, build_chain(model))
     left_out = {*left_out, *unmoved(model, recordings)}
     able = [k for k in ALL if k.sought in ("hypothesis", "rig", "structure") and k.name not in left_out]
-    return tuple((k, max(k.odds.get(kind, k.odds.get("any", 0.0)), RARE)) for k in able)
+    return tuple((k, k.prior_odds(kind)) for k in able)
 
 
 def _begin(model: Model, bench: Bench) -> _ChainProposals:

@@ -9,9 +9,6 @@ from dataclasses import dataclass
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import counted_as
 
-#: Prior odds, at least, of any effect in any rig.
-RARE = 0.01
-
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:

@@ -13,7 +13,7 @@ import pytest
 
 import autotune
 from autotune.effects import ALL, CATALOGUE, kind_of
-from autotune.effects.base import EffectKind, Quantity
+from autotune.effects.base import EffectKind, Quantity, lacking
 from autotune.effects.checks import require_complete
 from autotune.effects.stages import Line, LinearPart, Memory
 from autotune.errors import InputError
@@ -58,7 +58,7 @@ def test_a_complete_record_is_taken() -> None:
             {"parameters": (Quantity(name="coefficient", unit="{q}", role="amplitude"),)},
             r"unit '\{q\}'.*are \{u\}",
         ),
-        ({"odds": {"automobile": 0.1}}, "no kind of rig: 'automobile'"),
+        ({"odds": lacking(usual="automobile")}, "no kind of rig: 'automobile'"),
         ({"lines": ()}, r"nothing would be simulated; add lines="),
         ({"lines": (Line(stage="force", does=with_typing_error),)}, "takes 'coeficient', which is neither a signal"),
         ({"lines": (Line(stage="nowhere", does=dragged),)}, "no stage 'nowhere'"),  # type: ignore[arg-type]
