@@ -63,7 +63,7 @@ SELF = -m pip install --quiet --disable-pip-version-check --no-deps --no-build-i
 $(VENV)/.run: pyproject.toml .ci/lock/run.txt
 	$(PYTHON) -c 'import sys; sys.exit("Python >= 3.11 is needed, this is " + sys.version.split()[0] if sys.version_info < (3, 11) else 0)'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@echo "Installing into $(VENV): about half a GB, one to five minutes. The first run then compiles for about a minute."
+	@echo "Installing into $(VENV): about half a GB, one to five minutes. The first run then compiles for about half a minute."
 	$(BIN)/python $(LOCKED) .ci/lock/run.txt
 	$(BIN)/python $(SELF)
 	touch $@

@@ -88,7 +88,7 @@ def announce_compiling() -> None:
     folder, kept = kept_code()
     # where the package cannot be written the compiler keeps its code elsewhere, and nothing is known of it
     if not kept and (os.environ.get("NUMBA_CACHE_DIR") or os.access(folder, os.W_OK)):
-        typer.echo("note: compiling, once after an installation: about a minute", err=True)
+        typer.echo("note: compiling, once after an installation: about half a minute", err=True)
 
 
 OVERWRITE = Annotated[bool, typer.Option("--overwrite", help="replace what is at --out; an input never is")]

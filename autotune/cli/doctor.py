@@ -138,10 +138,10 @@ def _check_compiled() -> Check:
     # where the package cannot be written the compiler keeps its code in the user's cache folder
     places = [own] if os.environ.get("NUMBA_CACHE_DIR") else [own, Path.home()]
     if not any(os.access(place, os.W_OK) for place in places):
-        remedy = "set NUMBA_CACHE_DIR to a folder you may write; every run compiles for about a minute otherwise"
+        remedy = "set NUMBA_CACHE_DIR to a folder you may write; every run compiles for about half a minute otherwise"
         return Check(subject=subject, found=f"cannot be kept in {places[0]}", verdict="note", remedy=remedy)
     if not kept:
-        remedy = "nothing to do: the first run compiles for about a minute"
+        remedy = "nothing to do: the first run compiles for about half a minute"
         return Check(subject=subject, found="none yet", verdict="note", remedy=remedy)
     return Check(subject=subject, found=f"{kept} functions kept in {own}")
 
