@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import get_args
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from autotune.diagnosis.selection.judged import Judged
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import kind_of
 from autotune.effects.base import PRIOR_ODDS
+from autotune.effects.rigs import RigKind
 from autotune.models import Effect
 
 
@@ -109,8 +111,8 @@ def odds_of(effect: Effect) -> float:
 
     Of what kind of rig equations are is not known, so that nothing is expected of them.
     """
-    words = kind_of(effect.name).odds.values()
-    return min(max((PRIOR_ODDS[word] for word in words), default=PRIOR_ODDS["rare"]), PRIOR_ODDS["usual"])
+    kind = kind_of(effect.name)
+    return min(max(kind.prior_odds(rig) for rig in get_args(RigKind)), PRIOR_ODDS["usual"])
 
 
 def judge(bench: Bench, outcome: Outcome, own: int) -> JudgedEquations | None:

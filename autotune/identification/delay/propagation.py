@@ -10,6 +10,7 @@ from autotune.arrays import FloatArray
 
 _OVERFLOW = 1e100
 _NEGLIGIBLE = 1e-150
+_RESOLUTION = 1e-13  # of the time: durations that differ by less are rounding's
 BLOCK = 2048  # pieces that are carried at once
 
 
@@ -47,7 +48,6 @@ def schedule(
     ty: FloatArray,
     h: float,
     clock: FloatArray,
-    resolution: float,
 ) -> tuple[FloatArray, int, FloatArray, NDArray[np.int64]]:
     """Cut the time from the clock on into pieces, up to a block of them.
 
@@ -65,8 +65,6 @@ def schedule(
         Delay [s].
     clock : (3,) array
         Time [s], row of the delayed input, next output; moves on in place.
-    resolution : float
-        Durations that differ by less than this share of the time at the block's end are one.
 
     Returns
     -------
@@ -110,7 +108,7 @@ def schedule(
     clock[0] = now
     clock[1] = j
     clock[2] = k
-    durations, which = _distinct(pieces, count, resolution * abs(now))
+    durations, which = _distinct(pieces, count, _RESOLUTION * abs(now))
     return pieces, k - first, durations, which
 
 

@@ -16,8 +16,11 @@ over the blocks is Python's, as a compiled one would contain, and compile, all o
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from autotune.arrays import FloatArray
 from autotune.identification.delay.compiled import cholesky_solve, transitions
@@ -28,8 +31,6 @@ from autotune.identification.delay.propagation import (
     propagate_sensitivities,
     schedule,
 )
-
-_RESOLUTION = 1e-13  # of the time: durations that differ by less are rounding's
 
 
 def normal_matrix(
@@ -87,18 +88,32 @@ def normal_matrix(
     coefficients, chains, clock = begin(tu, ty, a, h, theta)
     rows = np.zeros((order + BLOCK, width))
     white = np.empty((BLOCK, width))
-    first = 0
-    while first < ty.size:
-        pieces, outputs, durations, which = schedule(tu, u, before, linear, ty, h, clock, _RESOLUTION)
-        F = transitions(coefficients, durations)
+    for first, outputs, pieces, F, which in _blocks(tu, u, before, linear, ty, h, coefficients, clock):
         if not propagate(a, F, which, pieces, m, chains, rows[order:]):
             return gram, False
         if sensitive:
             propagate_sensitivities(a, theta, F, which, pieces, chains, rows[order:])
         skip = max(0, min(order - first, outputs))
         _add_rows(gram, rows, white, y[first : first + outputs], skip, whitening, sensitive)
-        first += outputs
     return gram, bool(np.all(np.isfinite(gram)))
+
+
+def _blocks(
+    tu: FloatArray,
+    u: FloatArray,
+    before: float,
+    linear: bool,
+    ty: FloatArray,
+    h: float,
+    coefficients: FloatArray,
+    clock: FloatArray,
+) -> Iterator[tuple[int, int, FloatArray, FloatArray, NDArray[np.int64]]]:
+    """Yield each block's first output, how many it has, its pieces, their distinct transitions, and each piece's."""
+    first = 0
+    while first < ty.size:
+        pieces, outputs, durations, which = schedule(tu, u, before, linear, ty, h, clock)
+        yield first, outputs, pieces, transitions(coefficients, durations), which
+        first += outputs
 
 
 @njit(cache=True, nogil=True)
@@ -168,14 +183,10 @@ def output(
     x = np.full(ty.size, np.nan)
     coefficients, chains, clock = begin(tu, ty, a, h, theta)
     rows = np.zeros((BLOCK, theta.size))
-    first = 0
-    while first < ty.size:
-        pieces, outputs, durations, which = schedule(tu, u, before, linear, ty, h, clock, _RESOLUTION)
-        F = transitions(coefficients, durations)
+    for first, outputs, pieces, F, which in _blocks(tu, u, before, linear, ty, h, coefficients, clock):
         if not propagate(a, F, which, pieces, theta.size - 2 - n, chains, rows):
             break
         x[first : first + outputs] = sum(rows[:outputs, c] * theta[c] for c in range(theta.size))
-        first += outputs
     return x
 
 
@@ -211,14 +222,10 @@ def sensitivities(
     n, m = len(a), theta.size - 2 - len(a)
     columns = np.zeros((ty.size, 2 * n + m + 4))
     coefficients, chains, clock = begin(tu, ty, a, h, theta)
-    first = 0
-    while first < ty.size:
-        pieces, outputs, durations, which = schedule(tu, u, before, linear, ty, h, clock, _RESOLUTION)
-        F = transitions(coefficients, durations)
+    for first, _, pieces, F, which in _blocks(tu, u, before, linear, ty, h, coefficients, clock):
         if not propagate(a, F, which, pieces, m, chains, columns[first:]):
             break
         propagate_sensitivities(a, theta, F, which, pieces, chains, columns[first:])
-        first += outputs
     return columns[:, : 2 * n + m + 3]
 
 
