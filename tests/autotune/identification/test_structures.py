@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ import autotune as at
 from autotune.cli.closed_loop import closed_loop_json
 from autotune.design.margins import margins
 from autotune.errors import AutotuneError
-from autotune.identification.closed_loop.identify import identify_closed_loop
+from autotune.identification.closed_loop.identify import ClosedLoopIdentification, identify_closed_loop
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
 from autotune.recording import Recording
@@ -51,6 +52,13 @@ def loop(seed: int, limit: float = np.inf, moves: float = 1.0) -> Loop:
     return Loop(recording, TransferFunction(num=(1.0,), den=(lag, 1.0), delay_s=delay - 1.0))
 
 
+@cache
+def identified(seed: int) -> tuple[ClosedLoopIdentification, TransferFunction]:
+    """Return what a loop's recording is identified as, and its plant: two tests look at the same loops."""
+    recording, plant = loop(seed)
+    return identify_closed_loop(recording), plant
+
+
 def apart(point: FrequencyPoint, plant: TransferFunction) -> float:
     """Return how far a plant is from a point, in units of its covariance: chi-square of two values."""
     away = complex(plant.response(np.array([point.omega_rad_s]))[0]) - point.response
@@ -63,8 +71,7 @@ def test_regions_of_short_records_hold_the_plant_whatever_its_dead_time(first: i
     """Regions of one structure held .5 of these points, and .5 of those that a design was given."""
     points, given = [], []
     for seed in range(first, first + 15):
-        recording, plant = loop(1000 + seed)
-        found = identify_closed_loop(recording)
+        found, plant = identified(1000 + seed)
         points += [apart(point, plant) < USUAL for point in found.points]
         given += [apart(point, plant) < USUAL for point in found.design_points]
     assert np.mean(points) > 0.85
@@ -90,9 +97,8 @@ def test_a_design_keeps_its_margins_where_the_record_leaves_the_dead_time_open(t
     """On the region of one structure 10 of 37 such designs were unstable on the plant, 14 kept less than printed."""
     designs = below = 0
     for seed in range(1013, 1020):
-        recording, plant = loop(seed)
+        found, plant = identified(seed)
         path = tmp_path / f"{seed}.json"
-        found = identify_closed_loop(recording)
         path.write_text(json.dumps(closed_loop_json(found)), encoding="utf-8")
         try:
             given = at.tune(str(path), noise_gain=20.0)

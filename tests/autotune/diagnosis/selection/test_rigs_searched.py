@@ -55,9 +55,15 @@ def good(recording: Recording):
     return [np.ones(len(recording), dtype=bool)]
 
 
-def test_gravity_and_dry_friction_of_a_pendulum_are_both_named_from_one_free_swing():
+@pytest.fixture(scope="module")
+def rubbing():
+    """Return a swing with gravity and dry friction, and what a search finds in it."""
     recording = swing(gravity=22.0, friction=0.25, damping=0.02)
-    found = search_chain(pendulum(20.0, 0.1), [recording], good(recording))
+    return recording, search_chain(pendulum(20.0, 0.1), [recording], good(recording))
+
+
+def test_gravity_and_dry_friction_of_a_pendulum_are_both_named_from_one_free_swing(rubbing):
+    _, found = rubbing
     assert set(found.chosen.names) >= {"plant.sine_torque", "plant.coulomb_friction"}
     assert found.chosen.error < 0.05 * found.retuned.error
 
@@ -179,12 +185,10 @@ def test_what_stands_for_something_else_once_it_is_fitted_to_the_end_is_not_judg
     assert sorted(lags.values()) == pytest.approx([19.0, 70.0], rel=0.1)
 
 
-def test_what_predicted_best_on_more_rows_is_judged_on_fewer_though_their_own_search_misses_it():
-    recording = swing(gravity=22.0, friction=0.25, damping=0.02)
-    model = pendulum(20.0, 0.1)
-    whole = search_chain(model, [recording], good(recording)).chosen
+def test_what_predicted_best_on_more_rows_is_judged_on_fewer_though_their_own_search_misses_it(rubbing):
+    recording, whole = rubbing[0], rubbing[1].chosen
     part = recording.only(np.arange(int(0.8 * len(recording))))
-    found = search_chain(model, [part], good(part), left_out=whole.names, begun=whole)
+    found = search_chain(pendulum(20.0, 0.1), [part], good(part), left_out=whole.names, begun=whole)
     assert found.chosen.names == whole.names
     assert found.chosen.log_odds == whole.log_odds
 
