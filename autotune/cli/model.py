@@ -128,8 +128,9 @@ def export(
     overwrite: OVERWRITE = False,
 ) -> None:
     """Write a model for another tool, its effects written out as equations."""
-    from autotune.equations.exports import as_latex, as_modelica, as_python, as_text
+    from autotune.equations.exports import as_modelica, as_python, as_text
     from autotune.equations.flatten import flattened
+    from autotune.equations.typeset import as_latex
 
     place = Output(out, inputs=(model,), overwrite=overwrite)
     equations = _equations(model)

@@ -1,4 +1,4 @@
-"""Equations for other tools: readable text, LaTeX, Modelica and a Python function.
+"""Equations for other tools: readable text, Modelica and a Python function.
 
 Every export is of the flattened model: effects are written out, so that nothing of this project is needed to run it.
 """
@@ -9,15 +9,9 @@ import math
 import re
 from collections.abc import Mapping
 
-from autotune.equations.expressions import Call, Expression, Name, Number, number_text, to_text
+from autotune.equations.expressions import Call, Expression, Name, Number, to_text
 from autotune.equations.flatten import flattened
 from autotune.equations.model import EquationModel
-
-_GREEK_NAMES = (
-    "alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi rho sigma tau phi chi psi omega Gamma "
-    "Delta Theta Lambda Xi Pi Sigma Phi Psi Omega "
-)
-_GREEK = frozenset(_GREEK_NAMES.split())
 
 
 def as_text(model: EquationModel) -> str:
@@ -37,72 +31,6 @@ def as_text(model: EquationModel) -> str:
 
 def _unit(unit: str) -> str:
     return f"   [{unit}]" if unit else ""
-
-
-def as_latex(model: EquationModel) -> str:
-    """Return the equations as a LaTeX ``align`` environment."""
-    flat = flattened(model)
-    lines = [rf"{_symbol(name)} &= {_latex(tree)[0]}" for name, tree in flat.defines]
-    lines += [rf"\dot{{{_symbol(one.name)}}} &= {_latex(one.derivative)[0]}" for one in flat.states]
-    lines.append(rf"y &= {_latex(flat.output)[0]}")
-    return "\\begin{align}\n  " + " \\\\\n  ".join(lines) + "\n\\end{align}\n"
-
-
-def _symbol(name: str) -> str:
-    head, _, tail = name.partition("_")
-    match = re.fullmatch(r"([A-Za-z]+)(\d+)", head)
-    if match and not tail:
-        head, tail = match[1], match[2]
-    shown = rf"\{head}" if head in _GREEK else head if len(head) == 1 else rf"\mathrm{{{head}}}"
-    return shown if not tail else rf"{shown}_{{\mathrm{{{tail.replace('_', ',')}}}}}"
-
-
-_LATEX_FUNCTIONS = {
-    **{name: rf"\{name}" for name in ("sin", "cos", "tan", "sinh", "cosh", "tanh", "exp", "log", "min", "max")},
-    "asin": r"\arcsin", "acos": r"\arccos", "atan": r"\arctan", "atan2": r"\operatorname{atan2}",
-    "sign": r"\operatorname{sgn}",
-}  # fmt: skip
-_LATEX_SIGNS = {"<": "<", "<=": r"\le", ">": ">", ">=": r"\ge"}
-
-
-def _latex(tree: Expression) -> tuple[str, int]:
-    """Return LaTeX and how tightly the outermost operator binds."""
-    match tree:
-        case Number(value):
-            mantissa, _, exponent = number_text(value).partition("e")
-            return (mantissa, 5) if not exponent else (rf"{mantissa} \cdot 10^{{{int(exponent)}}}", 2)
-        case Name("pi"):
-            return r"\pi", 5
-        case Name(name):
-            return _symbol(name), 5
-        case Call("neg", (inner,)):
-            return f"-{_inside(inner, 2)}", 1
-        case Call("/", (above, below)):
-            return rf"\frac{{{_latex(above)[0]}}}{{{_latex(below)[0]}}}", 4
-        case Call("*", (left, right)):
-            a, b = _inside(left, 2), _inside(right, 2)
-            return rf"{a} \cdot {b}" if b[0].isdigit() else rf"{a} \, {b}", 2
-        case Call(("+" | "-") as sign, (left, right)):
-            return f"{_inside(left, 1)} {sign} {_inside(right, 1 if sign == '+' else 2)}", 1
-        case Call("^", (base, exponent)):
-            return f"{{{_inside(base, 5)}}}^{{{_latex(exponent)[0]}}}", 3
-        case Call("sqrt", (inner,)):
-            return rf"\sqrt{{{_latex(inner)[0]}}}", 5
-        case Call("abs", (inner,)):
-            return rf"\left|{_latex(inner)[0]}\right|", 5
-        case Call("if", (condition, then, otherwise)):
-            a, b, c = (_latex(one)[0] for one in (then, otherwise, condition))
-            return rf"\begin{{cases}} {a} & {c} \\ {b} & \text{{otherwise}} \end{{cases}}", 0
-        case Call(sign, (left, right)) if sign in _LATEX_SIGNS:
-            return f"{_latex(left)[0]} {_LATEX_SIGNS[sign]} {_latex(right)[0]}", 0
-    assert isinstance(tree, Call)
-    among = ", ".join(_latex(one)[0] for one in tree.arguments)
-    return rf"{_LATEX_FUNCTIONS[tree.function]}\left({among}\right)", 5
-
-
-def _inside(tree: Expression, at_least: int) -> str:
-    text, binding = _latex(tree)
-    return text if binding >= at_least else rf"\left({text}\right)"
 
 
 def as_modelica(model: EquationModel) -> str:

@@ -14,12 +14,12 @@ from autotune.diagnosis.evidence.unseen_run import UnseenRun
 from autotune.diagnosis.result import Diagnosis, FoundEffect
 from autotune.equations.exports import as_text
 from autotune.equations.model import EquationModel
+from autotune.equations.typeset import as_mathml
 from autotune.errors import InputError
 from autotune.models import Parameter
 from autotune.report.chain_diagram import chain_diagram
 from autotune.report.diagnosis_words import answers, in_the_model, objections, places_of, verdict_of
 from autotune.report.effect_words import clause, in_short, number, of_candidate, sentence, with_spread
-from autotune.report.formulas import model_formulas
 from autotune.report.law_figures import acting_figure, file_names, free_run_figure, law_figure
 from autotune.report.page import Figure, Page, Section, Table, Tone, write_page
 from autotune.report.screen_figures import curve_figure, over_time, screen_sections, trace_figures
@@ -154,7 +154,7 @@ def _equations(found: Diagnosis) -> tuple[Section, ...]:
     if not isinstance(model, EquationModel):
         return ()
     try:
-        formulas, lines = model_formulas(model), as_text(model).split("\n\n")[-1].splitlines()
+        formulas, lines = as_mathml(model), as_text(model).split("\n\n")[-1].splitlines()
     except InputError:
         formulas, lines = (), ["Effects on samples are listed in extended_model.toml."]
     return (Section(title="The model to go on with", formulas=formulas, text=tuple(line for line in lines if line)),)

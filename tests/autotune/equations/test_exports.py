@@ -15,10 +15,11 @@ from scipy.integrate import solve_ivp
 
 from autotune.equations import Drive, EquationModel, apply, compile_model, read_equations, simulate, write_equations
 from autotune.equations.chain import from_chain
-from autotune.equations.exports import as_latex, as_modelica, as_python, as_text
+from autotune.equations.exports import as_modelica, as_python, as_text
 from autotune.equations.files import read_any_model
 from autotune.equations.flatten import flattened
 from autotune.equations.linearise import as_chain, linearise, transfer_function
+from autotune.equations.typeset import as_latex
 from autotune.errors import InputError
 from autotune.model_tables import read_model
 from autotune.models import Effect, Parameter, TransferFunction
