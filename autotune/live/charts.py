@@ -5,17 +5,23 @@ A key with a leading colon is evaluated in the browser: text takes the colour of
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from autotune.arrays import FloatArray
+from autotune.arrays import ComplexArray, FloatArray
 from autotune.live.axis_ends import linear_ends, log_ends, phase_ends
 from autotune.live.story import Story
-from autotune.report.figures import frequencies, gain_phase, gain_phase_bars, region, usual_range
+from autotune.report.figures import (
+    axis_title,
+    frequencies,
+    gain_phase,
+    gain_phase_bars,
+    ratio_title,
+    region,
+    usual_range,
+)
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, thinned
 
 #: regions of the points are drawn so many times larger, in every direction, where they would be too small to see
@@ -23,14 +29,19 @@ MAGNIFIED = 10.0
 #: part of the picture that a region's axis must reach to be drawn in its true size
 SEEN_SHARE = 0.03
 ROWS = 900
-#: part of the time shown that a state must last for its name to have room above the picture
-LABEL_SHARE = 0.11
+TIME, FREQUENCY = "time [s]", "angular frequency [rad/s]"
+#: room on the right for what stands beside a trace [px]
+BESIDE = 44
+#: part of the time shown that a state must last for its name to have room above a narrow picture
+LABEL_SHARE = 0.3
 INK = "getComputedStyle(document.body).color"
 
 Options = dict[str, Any]
 
-#: what a name stands on, so that no curve crosses it
-PLATE = {":backgroundColor": "getComputedStyle(document.body).backgroundColor", "padding": [1, 3]}
+#: names stand beside the picture, where no curve crosses them
+LABEL: Options = {"fontSize": 12, "position": "end", "rotate": 0, "align": "left", "distance": 3, ":color": INK}
+#: where y may swing is shaded; the page's note says how far that is, as a name in the picture would lie on the trace
+SWING: Options = {"silent": True, "itemStyle": {"color": "rgba(128,128,128,0.10)"}}
 #: the band is its width on its lower edge, which may be negative
 STACK = {"stack": "band", "stackStrategy": "all"}
 
@@ -83,7 +94,7 @@ def strip_options(story: Story, span_s: float) -> Options:
     marks = [(at, name) for at, name in story.marks if t.size and at >= t[0]]
     spaced = [
         (at, name if later - at > LABEL_SHARE * (now_s - t[0]) else "")
-        for (at, name), (later, _) in pairwise([*marks, (math.inf, "")])
+        for (at, name), (later, _) in pairwise([*marks, (now_s, "")])
     ]
     y_lines = [(limits["y_min"], "y_min"), (limits["y_max"], "y_max")] if limits else []
     u_lines = [(limits["u_min"], "u_min"), (limits["u_max"], "u_max")] if limits else []
@@ -92,16 +103,16 @@ def strip_options(story: Story, span_s: float) -> Options:
     u_range = usual_range(u) if u.size else [0.0, 1.0]
     y_line = _line("y", t, y, BLUE, width=1.4) | {
         "markLine": _marks(y_lines, spaced),
-        "markArea": _swing(low, high) if limits else {},
+        "markArea": SWING | {"data": [[{"yAxis": low}, {"yAxis": high}]]} if limits else {},
     }
     u_line = _line("u", t, u, ORANGE, grid=1, step=True) | {"markLine": _marks(u_lines, [(at, "") for at, _ in marks])}
-    seconds = _seconds(grid=1) | {"min": max(0.0, now_s - span_s) if t.size else 0.0, "max": max(now_s, 1.0)}
+    seconds = _seconds(max(0.0, now_s - span_s) if t.size else 0.0, max(now_s, 1.0), grid=1)
     return _options(
-        grids=[{"top": 48, "height": "51%"}, {"top": "67%", "bottom": 30}],
+        grids=[{"top": 48, "height": "51%", "right": BESIDE}, {"top": "67%", "bottom": 30, "right": BESIDE}],
         x_axes=[seconds | {"gridIndex": 0, "name": "", ":axisLabel": "({show: false})"}, seconds],
         y_axes=[
-            _axis(f"y [{y_unit}]") | linear_ends(float(shown.min()), float(shown.max())),
-            _axis(f"u [{u_unit}]", grid=1) | linear_ends(*u_range),
+            _axis(axis_title("y", y_unit)) | linear_ends(float(shown.min()), float(shown.max())),
+            _axis(axis_title("u", u_unit), grid=1) | linear_ends(*u_range),
         ],
         series=[y_line, _line("set-point", t, r, GREY, dash="dashed", width=1.2), u_line],
         legend=["y", "set-point", "u"],
@@ -127,12 +138,12 @@ def bode_options(story: Story) -> Options:
                 curve = gain_phase(sign * model.response(omega))
                 series += [_line(name, omega, curve[0], colour), _line(name, omega, curve[1], colour, grid=1)]
                 names.append(name)
-    frequency = _axis("rad/s", grid=1) | {"type": "log", **log_ends(at)}
+    frequency = _axis(FREQUENCY, grid=1) | {"type": "log", **log_ends(at)}
     return _options(
         grids=[{"top": 34, "height": "38%"}, {"top": "55%", "bottom": 30}],
         x_axes=[frequency | {"gridIndex": 0, "name": "", ":axisLabel": "({show: false})"}, frequency],
         y_axes=[
-            _axis(f"gain [{y_unit}/{u_unit}]") | {"type": "log", **log_ends(gain)},
+            _axis(ratio_title("gain", y_unit, u_unit)) | {"type": "log", **log_ends(gain)},
             _axis("phase [deg]", grid=1) | phase_ends(phase_deg),
         ],
         series=series,
@@ -147,28 +158,23 @@ def regions_options(story: Story) -> tuple[Options, float]:
     extent = float(np.ptp(np.concatenate([centres.real, centres.imag, [0.0]]))) or 1.0
     largest = max((float(point.region_radii()[0].max()) for point in story.points), default=0.0)
     times = MAGNIFIED if largest < SEEN_SHARE * extent else 1.0
-    series = [_dots("points", centres.real, centres.imag, BLUE, labels=story_labels(story))]
+    series = [_dots("points", centres.real, centres.imag, BLUE)]
     for point, centre in zip(story.points, centres, strict=True):
         edge = centre + times * (region(point, complex(sign)) - centre)
-        series.append(_line("95 % region", edge.real, edge.imag, ORANGE, width=1.6))
+        series.append(_region_edge(edge[:-1], f"{point.omega_rad_s:.3g}"))
     if story.plant is not None and story.points:
         omega = frequencies(story.points, decades=0.15, count=80)
         curve = sign * story.plant.response(omega)
         series.append(_line("fitted plant", curve.real, curve.imag, GREEN))
     axis = {"scale": True, "splitNumber": 4}
     options = _options(
-        grids=[{"top": 34, "bottom": 30}],
+        grids=[{"top": 34, "bottom": 30, "right": BESIDE}],
         x_axes=[_axis("real part") | axis],
         y_axes=[_axis("imaginary part") | axis],
         series=series,
         legend=["points", "95 % region", *(["fitted plant"] if story.plant is not None else [])],
     )
     return options, times
-
-
-def story_labels(story: Story) -> list[str]:
-    """Return the frequency of every point, for its label."""
-    return [f"{point.omega_rad_s:.3g}" for point in story.points]
 
 
 def steps_options(story: Story) -> Options:
@@ -179,8 +185,8 @@ def steps_options(story: Story) -> Options:
     band |= STACK | {"areaStyle": {"color": GREEN, "opacity": 0.2}}
     return _options(
         grids=[{"top": 34, "bottom": 30}],
-        x_axes=[_seconds() | {"min": 0.0, "max": float(t[-1])}],
-        y_axes=[_axis(f"y - operating point [{story.units[1]}]") | {"scale": True}],
+        x_axes=[_seconds(0.0, float(t[-1]))],
+        y_axes=[_axis(axis_title("y - operating point", story.units[1])) | {"scale": True}],
         series=[
             _line("low", t, steps["low"], GREEN, width=0.0) | STACK,
             band,
@@ -213,7 +219,7 @@ def _axis(name: str, *, grid: int = 0) -> Options:
         "gridIndex": grid,
         "name": name,
         "nameLocation": "middle",
-        "nameGap": 20 if name in ("s", "rad/s", "real part") else 46,
+        "nameGap": 20 if name in (TIME, FREQUENCY, "real part") else 46,
         "nameTextStyle": {":color": INK},
         "axisLabel": {":color": INK, "hideOverlap": True, ":formatter": "v => +v.toPrecision(3)"},
         "axisLine": {"lineStyle": {"color": GREY}},
@@ -221,10 +227,11 @@ def _axis(name: str, *, grid: int = 0) -> Options:
     }
 
 
-def _seconds(*, grid: int = 0) -> Options:
-    """Return an axis of time whose end is now, which is no round number and gets no label."""
-    axis = _axis("s", grid=grid)
-    return axis | {"axisLabel": axis["axisLabel"] | {"showMaxLabel": False}}
+def _seconds(first_s: float, last_s: float, *, grid: int = 0) -> Options:
+    """Return an axis of time, whose ends move on with the run: where they are no round numbers they get no labels."""
+    axis = _axis(TIME, grid=grid)
+    ends = {"showMinLabel": first_s == 0.0, "showMaxLabel": False}
+    return axis | {"min": first_s, "max": last_s, "axisLabel": axis["axisLabel"] | ends}
 
 
 def _line(
@@ -246,22 +253,17 @@ def _line(
     return line | {"step": "end"} if step else line
 
 
-def _dots(
-    name: str, x: FloatArray, y: FloatArray, colour: str, *, grid: int = 0, labels: Sequence[str] = ()
-) -> Options:
-    pairs = _pairs(x, y)
-    data: list[Any] = (
-        [{"value": pair, "name": label} for pair, label in zip(pairs, labels, strict=True)] if labels else pairs
-    )
-    return {
-        "name": name,
-        "type": "scatter",
-        "xAxisIndex": grid,
-        "yAxisIndex": grid,
-        "symbolSize": 8,
-        "itemStyle": {"color": colour},
-        "label": {"show": bool(labels), "formatter": "{b}", "position": "right", ":color": INK},
-        "data": data,
+def _dots(name: str, x: FloatArray, y: FloatArray, colour: str, *, grid: int = 0) -> Options:
+    return _line(name, x, y, colour, grid=grid) | {"type": "scatter", "symbolSize": 8}
+
+
+def _region_edge(edge: ComplexArray, name: str) -> Options:
+    """Return an open edge closed where it is furthest right, and its name below that: off region, point and curve."""
+    turned = np.roll(edge, -int(edge.real.argmax()))
+    closed = np.append(turned, turned[0])
+    return _line("95 % region", closed.real, closed.imag, ORANGE, width=1.6) | {
+        "endLabel": {"show": True, "formatter": name, ":color": INK, "offset": [0, 9]},
+        "labelLayout": {"hideOverlap": True},
     }
 
 
@@ -274,19 +276,13 @@ def _bars(x: FloatArray, y: FloatArray, half: FloatArray, colour: str, *, grid: 
 
 
 def _marks(lines: list[tuple[float, str]], instants: list[tuple[float, str]]) -> Options:
-    def mark(where: dict[str, float], text: str, colour: str, label: Options) -> Options:
-        shown = {"formatter": text, "show": bool(text), ":color": INK, "fontSize": 12, **PLATE} | label
-        return where | {"lineStyle": {"color": colour, "type": "dotted"}, "label": shown}
+    def mark(axis: str, value: float, text: str, colour: str) -> Options:
+        label = LABEL | {"formatter": text, "show": bool(text)}
+        return {axis: value, "lineStyle": {"color": colour, "type": "dotted"}, "label": label}
 
-    limits = [mark({"yAxis": value}, text, RED, {"position": "insideEndTop"}) for value, text in lines]
-    begins = [mark({"xAxis": at}, text, GREY, {"position": "end", "rotate": 0, "distance": 2}) for at, text in instants]
+    limits = [mark("yAxis", value, text, RED) for value, text in lines]
+    begins = [mark("xAxis", at, text, GREY) for at, text in instants]
     return {"symbol": "none", "silent": True, "animation": False, "data": [*limits, *begins]}
-
-
-def _swing(low: float, high: float) -> Options:
-    area = [{"yAxis": low, "name": "allowed swing"}, {"yAxis": high}]
-    label = {"position": "insideBottomLeft", ":color": INK, "fontSize": 12}
-    return {"silent": True, "itemStyle": {"color": "rgba(128,128,128,0.10)"}, "label": label, "data": [area]}
 
 
 def _pairs(x: FloatArray, y: FloatArray) -> list[list[float | None]]:

@@ -16,6 +16,7 @@ from autotune.experiment.leaving import sentence
 from autotune.live.charts import Pictures
 from autotune.live.controls import Controls
 from autotune.live.story import Story
+from autotune.report.figures import ratio_title
 
 #: what the strip chart shows [s]
 SPANS = {20.0: "20 s", 60.0: "60 s", math.inf: "All"}
@@ -192,9 +193,8 @@ class Screen:
             bode, plane, times, steps = self._pictures.facts()
             self._show(self._bode, bode)
             self._show(self._plane, plane)
-            self._plane_note.text = (
-                f"95 % regions, drawn {times:g} times as large." if times > 1.0 else "95 % regions in their true size."
-            )
+            size = f"drawn {times:g} times as large" if times > 1.0 else "in their true size"
+            self._plane_note.text = f"At the angular frequencies beside them [rad/s]; 95 % regions {size}."
             self._show(self._steps, steps)
         self._shown = (rows, facts)
         self._drawing, self._drawn_s = True, now_s
@@ -351,7 +351,7 @@ def _gain_rows(story: Story) -> list[tuple[str, str, str]]:
         return "-" if controller is None else f"{getattr(controller, name):.4g}".replace("inf", "∞")
 
     rows = [("", "old gains", "new gains")]
-    names = {"K": f"K [{u_unit}/{y_unit}]", "Ti_s": "T_I [s]", "Td_s": "T_d [s]", "Tf_s": "T_f [s]"}
+    names = {"K": ratio_title("K", u_unit, y_unit), "Ti_s": "T_I [s]", "Td_s": "T_d [s]", "Tf_s": "T_f [s]"}
     for name, text in names.items():
         if name in ("K", "Ti_s") or any(c is not None and getattr(c, name) for c in (old, new)):
             rows.append((text, cell(old, name), cell(new, name)))

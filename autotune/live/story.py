@@ -299,7 +299,7 @@ class Story:
         return (
             f"Limits: u {limits['u_min']:g} to {limits['u_max']:g} {u_unit}, safe {limits['u_safe']:g} {u_unit};"
             f" y {limits['y_min']:g} to {limits['y_max']:g} {y_unit},"
-            f" within {limits['swing']:g} {y_unit} of {self.centre:g} {y_unit}; {limits['time_s']:g} s in all"
+            f" within {limits['swing']:g} {y_unit} of {self.centre:g} {y_unit} (shaded); {limits['time_s']:g} s in all"
         )
 
     def warnings(self) -> list[str]:

@@ -117,6 +117,20 @@ def test_regions_too_small_to_see_are_drawn_larger_and_the_page_is_told(tmp_path
         assert radius == pytest.approx(times * story.points[0].region_radii()[0].max(), rel=1e-3)
 
 
+def test_names_of_states_stand_apart_and_no_region_is_written_over(tmp_path: Path) -> None:
+    story = Story(tmp_path)
+    for k in range(61):
+        for column, value in ((story.rows.t, k), (story.rows.u, 0), (story.rows.y, 5), (story.rows.r, 5)):
+            column.append(float(value))
+    story.marks = [(0.0, "preflight"), (0.5, "find the mid-point"), (2.0, "relay sweep"), (58.0, "verify")]
+    lines = strip_options(story, 60.0)["series"][0]["markLine"]["data"]
+    assert [line["label"]["formatter"] for line in lines if line["label"]["show"]] == ["relay sweep"]
+    story.points = (POINT,)
+    edge = regions_options(story)[0]["series"][1]
+    assert edge["endLabel"]["formatter"] == "2"
+    assert edge["data"][-1][0] == max(x for x, _ in edge["data"])
+
+
 def test_charts_can_be_drawn_before_anything_is_known(tmp_path: Path) -> None:
     story = Story(tmp_path)
     story.poll()
