@@ -80,8 +80,9 @@ class Verification:
         Of the smoothed measurement, and their means over the drawn plants and noise.
     predicted_sd : StepFigures
         Standard deviation of the figures over the drawn plants and noise.
-    by : {"host", "device"}
-        Whose law ran: the host's, in the place of the rig's own controller, or that controller itself.
+    by : {"host", "device", "simulation"}
+        Whose law ran: the host's, in the place of the rig's own controller, or that controller itself; or the host's on
+        a simulated rig, beside which there is no other.
     untried : str
         Why the rig's own controller was not tried, where it was not.
     running_law : RunningLaw or None
@@ -99,7 +100,7 @@ class Verification:
     measured: StepFigures
     predicted: StepFigures
     predicted_sd: StepFigures
-    by: Literal["host", "device"] = "host"
+    by: Literal["host", "device", "simulation"] = "host"
     untried: str = ""
     running_law: RunningLaw | None = None
 
@@ -108,6 +109,8 @@ class Verification:
         """Say which law was verified."""
         if self.by == "device":
             return "the device's own law verified"
+        if self.by == "simulation":
+            return "host's law verified on a simulated rig"
         if not self.untried:  # the rig has none
             return "host's law verified"
         return f"host's law verified; the device's own law not tried ({self.untried})"
@@ -228,7 +231,7 @@ def judge(
     *,
     u_rest: float,
     seed: int = 0,
-    by: Literal["host", "device"] = "host",
+    by: Literal["host", "device", "simulation"] = "host",
     untried: str = "",
     running_law: RunningLaw | None = None,
 ) -> Verification:

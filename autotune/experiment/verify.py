@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -22,7 +23,7 @@ from autotune.experiment.loop import ControlLoop
 from autotune.experiment.own_law import law_of, try_own_law
 from autotune.experiment.result import State, Status
 from autotune.experiment.return_to_setpoint import is_near, setpoint_before
-from autotune.experiment.rig import Exchanges, HoldsGains, Rig, RunsLaws, RunsOwnController, TrialGains
+from autotune.experiment.rig import Exchanges, Rig, RunsLaws, RunsOwnController, TrialGains
 from autotune.experiment.run import (
     OnStatus,
     bring_to_operating_point,
@@ -213,15 +214,15 @@ def run_verification(
     if isinstance(rig, RunsLaws):
         law = replace(law, u_rate=math.inf)  # the device's own PI has no limit of the rate
         return judge(test, y, u, law, fit, noise_sd, u_rest=known.midpoint, by="device")
-    return judge(test, y, u, law, fit, noise_sd, u_rest=known.midpoint, untried=untried)
+    alone = config.rig.kind == "simulated" and not untried
+    by: Literal["host", "simulation"] = "simulation" if alone else "host"
+    return judge(test, y, u, law, fit, noise_sd, u_rest=known.midpoint, by=by, untried=untried)
 
 
 def _own_controller(rig: Rig, on_device: bool) -> tuple[RunsOwnController | None, str]:
     """Return the rig where its own controller is to be tried, else why it is not."""
-    if not isinstance(rig, HoldsGains) or isinstance(rig, RunsLaws):
+    if not isinstance(rig, RunsOwnController) or isinstance(rig, RunsLaws):
         return None, ""
-    if not isinstance(rig, RunsOwnController):
-        return None, "the host has no means to start it"
     if rig.not_startable:
         return None, rig.not_startable
     return (rig, "") if on_device else (None, "the gains were not in it")

@@ -169,7 +169,7 @@ def deploy(
         with contextlib.suppress(ExperimentStopped):  # a full disk changes nothing of it
             notes.note(Step.REFUSED, new, verification.reason)
         return Deployment(old=old, new=new, verification=verification)
-    step = Step.KEPT if verification.by == "device" else Step.HOST_ONLY
+    step = Step.HOST_ONLY if verification.by == "host" else Step.KEPT
     why = f"{verification.whose}; {verification.reason}"
     held = trial.keep(step, why) if startable else _write(rig, new, old, notes, step, why)
     return Deployment(old=old, new=held, verification=verification)

@@ -30,7 +30,7 @@ def run_page(
     tuning: Tuning,
     diagnosis: Diagnosis | None = None,
     *,
-    dry_run: bool = False,
+    simulated: bool = False,
 ) -> Page:
     """Return the page of a whole run on a rig.
 
@@ -46,8 +46,8 @@ def run_page(
         What the run ended with.
     diagnosis : Diagnosis, optional
         What the fitted plant leaves out; its own page is in ``diagnosis/report.html`` beside this one.
-    dry_run : bool
-        Whether the rig's simulated twin took its place.
+    simulated : bool
+        Whether the rig is a simulated one, or its simulated twin took its place.
     """
     experiment, verification = tuning.experiment, tuning.verification
     sections = []
@@ -62,9 +62,9 @@ def run_page(
     sections += reversed(analysis_sections(tuning.analysis, signals, experiment))
     sections.append(experiment_section(recordings, experiment, signals))
     sections += warnings_sections((*experiment.warnings, *tuning.analysis.warnings))
-    verdict, good = _verdict(tuning, signals, dry_run)
+    verdict, good = _verdict(tuning, signals, simulated)
     return Page(
-        title=f"Rehearsal: {name}" if dry_run else f"Commissioning: {name}",
+        title=f"{'Simulated commissioning' if simulated else 'Commissioning'}: {name}",
         verdict=verdict,
         tone="good" if good else "bad" if verification is not None else "warn",
         answers=_answers(tuning, signals, diagnosis),
@@ -188,6 +188,8 @@ def _next_step(verification: Verification | None) -> str:
             "Put the device's own controller in automatic, stand beside it, and step its set-point: only the host's law"
             f" was verified ({verification.untried})."
         )
+    if verification.accepted and verification.by == "simulation":
+        return "Run it on the rig: a simulation shows what its model does, and nothing that the model leaves out."
     if verification.accepted:
         return "Watch the loop through its usual operating range; the points were measured at one of them."
     return (
@@ -196,16 +198,15 @@ def _next_step(verification: Verification | None) -> str:
     )
 
 
-def _verdict(tuning: Tuning, signals: SignalSettings, dry_run: bool) -> tuple[str, bool]:
+def _verdict(tuning: Tuning, signals: SignalSettings, simulated: bool) -> tuple[str, bool]:
     gains = designed_text(tuning.analysis.design, signals)
     if tuning.verification is None:
-        return f"{gains}: designed, not verified on the rig.", False
+        return f"{gains}: designed, not verified.", False
     if tuning.verification.accepted:
         held = "the rig holds its old gains" if tuning.old_controller else "its gains are in result.json"
         where = "the rig holds it now" if tuning.deployed else held
-        where = "this was its simulated twin, the rig was not touched" if dry_run else where
-        whose = "" if dry_run else f"{tuning.verification.whose}; "
-        return f"Accepted: {gains}; {tuning.verification.reason}; {whose}{where}.", True
+        where = "no real one was touched" if simulated else where
+        return f"Accepted: {gains}; {tuning.verification.reason}; {tuning.verification.whose}; {where}.", True
     return f"Not accepted: {gains}; {tuning.verification.reason}. The old gains were kept.", False
 
 
@@ -220,7 +221,7 @@ def _answers(tuning: Tuning, signals: SignalSettings, diagnosis: Diagnosis | Non
         found += f" Before: {before}. Now: {new}." if tuning.deployed else f" The rig holds {before}; designed: {new}."
     sure = margins_sentence(tuning.analysis, signals)
     if tuning.verification is not None:
-        sure += " The loop was tried on the rig: below, measured beside what was predicted."
+        sure += " The loop was tried: below, measured beside what was predicted."
     todo = (
         _next_step(tuning.verification)
         if diagnosis is None or diagnosis.verdict == "none"

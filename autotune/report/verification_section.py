@@ -38,7 +38,7 @@ def verification_section(verification: Verification, signals: SignalSettings) ->
         ),
     )
     return Section(
-        title="Verification on the rig",
+        title="Verification",
         text=(
             _test_text(verification.test, signals),
             sentence(f"{verification.whose}: {verification.reason}"),

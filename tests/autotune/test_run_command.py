@@ -223,7 +223,7 @@ def test_what_cannot_be_gone_on_with_is_refused_with_the_remedy(resumed: tuple[P
 def test_verified_gains_are_deployed_and_present_ones_verified_with_the_points_of_a_run(finished: Path) -> None:
     config, run = str(CONFIGS / "ball_sim.toml"), str(finished)
     for command, name, said in (
-        ("deploy", "deploy", "host's law verified"),
+        ("deploy", "deploy", "host's law verified on a simulated rig."),
         ("verify", "verify", "Accepted"),
     ):
         done = CliRunner().invoke(app, [command, config, "--run", run, *(["--yes"] if command == "deploy" else [])])
@@ -234,6 +234,5 @@ def test_verified_gains_are_deployed_and_present_ones_verified_with_the_points_o
         assert (finished / f"{name}.html").stat().st_size > 0
     assert told["controller"]["K"] == -0.01  # what the rig holds when it is delivered
     steps = [json.loads(line)["gains"] for line in (finished / "journal.jsonl").read_text().splitlines()]
-    assert steps[-2] == "writing"  # once the host's law is verified, as the rig's own cannot be tried
-    assert steps[-1] == "host's law verified; the device's own law not tried"
+    assert steps[-2:] == ["writing", "verified, kept"]  # no law but the host's would run there
     assert read_recording(finished / "verification-2.csv").metadata["ended"]["output"] == "safe output"
