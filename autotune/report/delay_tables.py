@@ -97,7 +97,7 @@ def delay_page(
     )
     one, two = one_delay[5.0][0], two_delays[0.1][0]
     return Page(
-        title="Delays by modulating functions, the examples of 2007",
+        title="Ollivier et al. 2007, delays by modulating functions: tables 1 and 2, figures 1 to 3",
         verdict=f"{sets} recordings of each example and noise: delay {np.mean(one[:, 3]):.3f} s for 4 s, delays"
         f" {np.mean(two[:, 2]):.3f} s and {np.mean(two[:, 3]):.3f} s for 2 s and 4 s.",
         tone="good",
@@ -182,4 +182,8 @@ def _figure(one: Followed) -> Figure:
         add_line(chart, one.t[few], one.state[few, i], "true", ORANGE, row=row, col=1, showlegend=False)
         add_line(chart, one.t[few], one.paper_state[few, i], "estimated", BLUE, row=row, col=1, showlegend=False)
     chart.update_xaxes(title="time [s]", row=len(titles), col=1)
-    return Figure(figure=chart, caption="From 10 s on; noise 5.", height_px=170 * len(titles))
+    return Figure(
+        figure=chart,
+        caption="Estimated on line from 10 s on, from a recording with noise of standard deviation 5.",
+        height_px=170 * len(titles),
+    )

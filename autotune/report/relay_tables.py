@@ -32,9 +32,9 @@ PRINTED_TEXT = (13.5, 4.3, 1.38, 2.05)
 #: The paper's PI, and N_max: +-0.035 V of noise allowed on the command for +-0.35 V of the sensor.
 PAPER_PI, PAPER_NOISE_GAIN = PIDController(K=-0.023, Ti_s=3.0), 0.1
 
-_ROWS_1 = ("G_r", "omega_d [rad/s]", "nu-gap", "b(C, H_r)", "b(C, H)")
+_ROWS_1 = ("G_r", "ω_d [rad/s]", "nu-gap", "b(C, H_r)", "b(C, H)")
 _ROWS_2 = (
-    "K", "T_I [s]", "M_m", "phase margin [deg]", "noise gain (15)", "N_max by (16)", "M_ret [s]", "omega_gc [rad/s]",
+    "K", "T_I [s]", "M_m", "phase margin [deg]", "noise gain (15)", "N_max by (16)", "M_ret [s]", "ω_gc [rad/s]",
     "norm (11)",
 )  # fmt: skip
 
@@ -126,10 +126,10 @@ def bandwidth_words(plant: TransferFunction, noise_gain: float, omega: FloatArra
     words = (
         []
         if math.isnan(line)
-        else [f"(26) lets the loop cross at {line:.3g} rad/s at most with N_max {noise_gain:.3g}"]
+        else [f"by (26) the loop crosses over at {line:.3g} rad/s at most with N_max {noise_gain:.3g}"]
     )
     if not math.isnan(limit):
-        words.append(f"on the plant itself no gain up to {noise_gain:.3g} crosses above {limit:.3g} rad/s")
+        words.append(f"on the plant itself no gain up to {noise_gain:.3g} crosses over above {limit:.3g} rad/s")
     return "; ".join(words)[:1].upper() + "; ".join(words)[1:] + "." if words else ""
 
 
@@ -153,7 +153,7 @@ def tables(
     cells = [f"{value:.4g}" for value in _row_1(reduced, found)]
     first = Table(
         caption="Reduced model and criterion (10): nu-gap < b(C, H_r) <= b(C, H).",
-        header=("G_r", "omega_0r [rad/s]", *_ROWS_1[1:]),
+        header=("G_r", "ω_0r [rad/s]", *_ROWS_1[1:]),
         rows=((cells[0], lag, *cells[1:]),),
     )
     columns = {name: _row_2(law, margins(plant, feedback(law))) for name, law in laws.items()}
@@ -220,7 +220,7 @@ def _printed_1(plant: TransferFunction, reduced: ReducedModel, found: Validation
     return Section(
         title="Table I: the reduced model",
         text=(
-            "Recomputed: G_r and omega_d are the limits that C1 and C2 of (5) set on (23); the printed 65 is below the"
+            "Recomputed: G_r and ω_d are the limits that C1 and C2 of (5) set on (23); the printed 65 is below the"
             " first, as it came from measured points. nu-gap and b are of the printed model with the paper's PI, in"
             " volts as they are (k = 1) and in the loop's own units.",
             f"Criterion (10) {'holds' if plain.holds else 'fails'} as printed: the nu-gap depends on the units of u and"
@@ -266,14 +266,14 @@ def _printed_text(
     best = next(iter(own.values())).crossover_rad_s
     N_max = PAPER_NOISE_GAIN
     values = (
-        ("crossover omega_0 of (23)", crossing(plant, 1.0, omega), math.nan),
+        ("crossover ω_0 of (23)", crossing(plant, 1.0, omega), math.nan),
         (
-            "omega_max of (26) for N_max = 0.1",
+            "ω_max of (26) for N_max = 0.1",
             asymptotic_bandwidth(plant, N_max, omega),
             bandwidth_limit(plant, N_max, omega),
         ),
-        ("omega_gc with the PI", of_paper["PI"].crossover_rad_s, best),
-        ("omega_gc with the RST", of_paper["RST"].crossover_rad_s, math.nan),
+        ("ω_gc with the PI", of_paper["PI"].crossover_rad_s, best),
+        ("ω_gc with the RST", of_paper["RST"].crossover_rad_s, math.nan),
     )
     return Section(
         title="Numbers of the text",
