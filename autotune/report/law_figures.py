@@ -68,7 +68,7 @@ def free_run_figure(run: UnseenRun, name: str) -> Figure:
     widest = 1.15 * max((float(np.nanquantile(np.abs(e), 0.995)) for e in shown), default=span)
     widest = min(widest, span) or span
     figure.update_yaxes(title=_with_unit("residual", run.unit), range=[-widest, widest], row=2, col=1)
-    figure.update_xaxes(title="t [s]", row=2, col=1)
+    figure.update_xaxes(title="time [s]", row=2, col=1)
     for a, b in zip(run.starts_s, run.heads_s, strict=True):
         figure.add_vrect(a, b, fillcolor="rgba(128,128,128,0.16)", line={"width": 0}, layer="below")
     return Figure(figure=figure, caption=_caption_of_run(run, name), height_px=460)

@@ -11,6 +11,7 @@ from autotune.diagnosis.routine.result import RoutineDiagnosis
 from autotune.diagnosis.routine.thresholds import RoutineThresholds
 from autotune.diagnosis.thresholds import table
 from autotune.report.chart import make_subplots
+from autotune.report.figures import axis_title
 from autotune.report.page import (
     BLUE,
     GREEN,
@@ -70,9 +71,9 @@ def _signals(found: RoutineDiagnosis) -> Section:
     add_line(figure, t, operation.y[part], "y recorded", GREY, row=1, col=1)
     add_line(figure, t, operation.u[part], "u recorded", GREY, dash="dot", row=2, col=1)
     add_line(figure, t, found.valves.position[part], "best faulty valve", GREEN, row=2, col=1)
-    figure.update_yaxes(title="y", row=1, col=1)
-    figure.update_yaxes(title="u and valve", row=2, col=1)
-    figure.update_xaxes(title="t [s]", row=2, col=1)
+    figure.update_yaxes(title=axis_title("y", operation.y_unit), row=1, col=1)
+    figure.update_yaxes(title=axis_title("u and valve", operation.u_unit), row=2, col=1)
+    figure.update_xaxes(title="time [s]", row=2, col=1)
     caption = (
         "The middle of the record. Below, the command and the position of the faulty valve that predicts y best: where"
         " it is the cause, y moves when this valve slips and rests while it rests."
@@ -82,20 +83,25 @@ def _signals(found: RoutineDiagnosis) -> Section:
 
 def _evidence(found: RoutineDiagnosis) -> Section:
     valves = found.valves
-    figure = lines_figure("t [s]", "squared error")
+    figure = lines_figure("time [s]", "share of squared error")
     whole = max(float(valves.linear @ valves.linear), 1e-300)
     for errors, name, colour in ((valves.linear, "by the command", ORANGE), (valves.faulty, "by the valve", BLUE)):
         add_line(figure, valves.t, np.cumsum(errors**2) / whole, name, colour)
     caption = (
-        "Squared errors of both predictions of y, added up from the start, over the whole of the linear one. A faulty"
-        " valve parts the curves a little at every slip; one that parts them once is an incident, and not a valve."
+        "Squared errors of both predictions of y, added up from the start; 1 is the sum of the linear one, by the"
+        " command. A faulty valve parts the curves a little at every slip; one that parts them once is an incident, and"
+        " not a valve."
     )
     return Section(title="Evidence, slip by slip", figures=(Figure(figure=figure, caption=caption, height_px=320),))
 
 
 def _curve(found: RoutineDiagnosis) -> Section:
     operation, part = found.operation, _section_of(found)
-    left, right = lines_figure("u", "y"), lines_figure("u", "best faulty valve")
+    u = axis_title("u", operation.u_unit)
+    left, right = (
+        lines_figure(u, axis_title("y", operation.y_unit)),
+        lines_figure(u, axis_title("valve", operation.u_unit)),
+    )
     add_line(left, operation.u[part], operation.y[part], "recorded", GREY, width=1.0)
     add_line(right, operation.u[part], found.valves.position[part], "valve", GREEN, width=1.2)
     ends = np.array([operation.u[part].min(), operation.u[part].max()])
@@ -113,7 +119,7 @@ def _curve(found: RoutineDiagnosis) -> Section:
 def _comparison(found: RoutineDiagnosis) -> Section:
     valves, seen, answer = found.valves, found.oscillation, found.answer
     facts = [
-        ("ln of squared error, by the command over by the best faulty valve", f"{valves.decrease:+.2f}"),
+        ("ln(squared error by the command / by the best faulty valve)", f"{valves.decrease:+.2f}"),
         ("chance of as much in the same loop with a linear valve", f"{valves.chance:.2g}"),
         ("reversals of the best faulty valve", f"{valves.reversals}"),
         ("band S over u's range", f"{valves.valve.S / valves.span:.2f}"),
@@ -121,7 +127,7 @@ def _comparison(found: RoutineDiagnosis) -> Section:
         ("period of the dominant oscillation [s]", f"{seen.period_s:.4g}"),
         ("periods in the record", f"{seen.periods:.0f}"),
         ("regularity of y (over 1: it oscillates)", f"{seen.regularity:.3g}"),
-        ("share of y's variance in that line", f"{seen.share:.2f}"),
+        ("share of y's variance at that period", f"{seen.share:.2f}"),
         ("share of y on stretches left out that one sine predicts", f"{seen.phase_kept:.2f}"),
     ]
     if answer is not None:

@@ -39,8 +39,8 @@ class Operation:
         Stretch that a window belongs to: stretches are left out whole.
     names : tuple of str
         Of the recordings.
-    u_unit : str
-        Unit of u, as the sidecar of the first recording has it; empty where it has none.
+    u_unit, y_unit : str
+        Units of u and y, as the sidecar of the first recording has them; empty where it has none.
     seen : float
         Share of the recorded time that is looked at; less than 1 where the recordings are long.
     """
@@ -56,6 +56,7 @@ class Operation:
     stretch_of: IntArray
     names: tuple[str, ...]
     u_unit: str = ""
+    y_unit: str = ""
     seen: float = 1.0
 
     @property
@@ -108,14 +109,15 @@ def operation_of(recordings: Sequence[Recording], limits: RoutineThresholds) -> 
         windows=windows,
         stretch_of=stretch_of,
         names=tuple(recording.name for recording in even),
-        u_unit=_unit_of_u(recordings[0]),
+        u_unit=_unit_of(recordings[0], "u"),
+        y_unit=_unit_of(recordings[0], "y"),
         seen=sum(recording.duration_s for recording in even) / spanned_s,
     )
 
 
-def _unit_of_u(recording: Recording) -> str:
+def _unit_of(recording: Recording, signal: str) -> str:
     units = recording.metadata.get("units", {})
-    unit = units.get("u", "") if isinstance(units, Mapping) else ""
+    unit = units.get(signal, "") if isinstance(units, Mapping) else ""
     return unit if isinstance(unit, str) else ""
 
 
