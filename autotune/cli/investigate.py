@@ -52,6 +52,7 @@ def investigate(
     from autotune.models import Model
     from autotune.pipeline.investigation import Budget, Listeners
     from autotune.pipeline.investigation import investigate as find_out
+    from autotune.report.investigation_page import list_candidates
 
     content = load_config(config)
     nominal = read_any(model)
@@ -71,7 +72,7 @@ def investigate(
         )  # fmt: skip
     for one in known.rounds:
         kind, on = one.plan.excitation.kind, one.plan.excitation.on
-        best = ", ".join(f"{name} {p:.2f}" for name, p in one.candidates[:2])
+        best = list_candidates(one.candidates, one.verdict)
         typer.echo(f"round {one.number}, {kind} on the {on}: {one.verdict}; {best}")
     found = known.diagnosis
     if found is not None:

@@ -209,8 +209,8 @@ def require_answer(recordings: Sequence[Recording]) -> None:
             where=where, remedy="record a set-point or a dither that moves the loop, or steps of u in open loop",
         )  # fmt: skip
     raise IdentificationError(
-        f"y has nothing to do with u beyond chance (probability {min(one.forward for one in found):.2g}, "
-        f"{CHANCE:g} is asked for)",
+        f"y has nothing to do with u beyond chance: noise alone does as much with a probability of "
+        f"{min(one.forward for one in found):.2g}, and at most {CHANCE:g} is accepted",
         where=where, remedy="check the columns; record larger or longer moves of u, after some rest",
     )  # fmt: skip
 

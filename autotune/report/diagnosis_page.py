@@ -44,6 +44,7 @@ def write_diagnosis_page(
     path: str | os.PathLike[str],
     controller: Controller | None = None,
     before: tuple[Section, ...] = (),
+    title: str = "Diagnosis",
 ) -> None:
     """Write the page of a diagnosis.
 
@@ -57,6 +58,8 @@ def write_diagnosis_page(
         The stated law, where the sidecars do not state it.
     before : tuple of Section
         What led to the diagnosis, shown after its summary.
+    title : str
+        What was done.
     """
     search = found.search
     known = _Evidence(
@@ -64,11 +67,11 @@ def write_diagnosis_page(
     )  # fmt: skip
     named, possible = places_of(found)
     page = Page(
-        title=f"Diagnosis of {found.extended_model.name}",
+        title=f"{title} of {found.extended_model.name}",
         verdict=verdict_of(found),
         tone=_TONES[found.verdict],
         drawing=chain_diagram(search.drawn, named, possible, throughout=search.several_levels),
-        answers=answers(found, known.run),
+        answers=answers(found),
         sections=(*before, *_sections(known, controller)),
     )
     write_page(page, path)
@@ -267,7 +270,13 @@ def _times(effect: FoundEffect, known: _Evidence, most: int = 6) -> str:
 def _against(known: _Evidence) -> Section:
     """Say what speaks against the finding: rivals, what was not excited, what is left."""
     found = known.found
-    rows = [(of_candidate(c.name), f"{c.probability:.3f}") for c in found.candidates if c.probability >= _LEAST]
+    # an effect is named and no hypothesis of one leads: the samples or the operating point show it by themselves
+    beside = found.verdict == "effect" and bool(found.candidates) and found.candidates[0].name == "none"
+    rows = [
+        (of_candidate(c.name, beside=beside), f"{c.probability:.3f}")
+        for c in found.candidates
+        if c.probability >= _LEAST
+    ]
     odds = Table(
         header=("explanation", "probability"), rows=tuple(rows[:_RIVALS]),
         caption="All explanations that were weighed, the likeliest first, by all rows and the parts that leave some"

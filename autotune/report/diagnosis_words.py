@@ -10,6 +10,7 @@ import numpy as np
 from autotune.diagnosis.evidence.missing_law import MissingLaw
 from autotune.diagnosis.evidence.unseen_run import UnseenRun
 from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment
+from autotune.diagnosis.verdict import OFFSET
 from autotune.effects import kind_of
 from autotune.report.effect_words import clause, in_short, joined, of_candidate, sentence, unit_of, with_spread
 
@@ -45,17 +46,15 @@ def places_of(found: Diagnosis) -> tuple[dict[str, list[str]], tuple[str, ...]]:
     return named, tuple(place for place in possible if place not in named)
 
 
-def answers(found: Diagnosis, run: UnseenRun | None) -> tuple[tuple[str, str], ...]:
+def answers(found: Diagnosis) -> tuple[tuple[str, str], ...]:
     """Return what was found, how sure that is, and what to do.
 
     Parameters
     ----------
     found : Diagnosis
         The result.
-    run : UnseenRun or None
-        A free run through what was not fitted.
     """
-    return (("What was found", _finding_text(found)), ("How sure", _sure(found, run)), ("What to do", _to_do(found)))
+    return (("What was found", _finding_text(found)), ("How sure", _sure(found)), ("What to do", _to_do(found)))
 
 
 def _finding_text(found: Diagnosis) -> str:
@@ -77,7 +76,7 @@ def _finding_text(found: Diagnosis) -> str:
     return " ".join(said)
 
 
-def _sure(found: Diagnosis, run: UnseenRun | None) -> str:
+def _sure(found: Diagnosis) -> str:
     said = [
         f"{in_short(e.name).capitalize()}: {_word(e.probability)} ({100 * e.probability:.0f} in 100)."
         for e in found.effects
@@ -85,10 +84,12 @@ def _sure(found: Diagnosis, run: UnseenRun | None) -> str:
     if found.verdict == "none":
         p = next((c.probability for c in found.candidates if c.name == "none"), math.nan)
         said += [f"That nothing is missing: {_word(p)} ({100 * p:.0f} in 100)."] if math.isfinite(p) else []
-    if run is not None and run.errors:
-        steps = ", ".join(f"{name} {_percent(error)}" for name, error in run.errors.items())
-        said.append(f"Error of a free run through unseen rows: {steps} of the spread of y.")
-    said.append(f"Noise alone would leave {_percent(found.fit.noise_floor)}.")
+    q = found.fit
+    errors = {"nominal": q.nominal, "retuned": q.retuned}
+    errors |= {"extended": q.extended} if found.search.has_effects else {}
+    steps = ", ".join(f"{name} {_percent(error)}" for name, error in errors.items())
+    said.append(f"Error of free runs through rows that were not fitted: {steps} of the spread of y.")
+    said.append(f"Noise alone would leave {_percent(q.noise_floor)}.")
     return " ".join(said)
 
 
@@ -150,6 +151,8 @@ def in_the_model(found: Diagnosis) -> str:
     named = {e.name for e in found.effects}
     more = [name for name in within if name not in named]
     if not within:
+        if named == {OFFSET}:
+            return "The retuned model has it as another operating point of its input."
         if found.effects:
             return (
                 "The extended model has none of it: it lasts for this recording alone, or a simulation cannot have it."

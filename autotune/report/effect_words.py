@@ -67,8 +67,17 @@ def with_spread(p: Parameter, digits: int = 4) -> str:
     return f"{number(p.value, digits)}{spread}{unit_of(p.unit)}"
 
 
-def of_candidate(name: str) -> str:
-    """Return a hypothesis in words, its effects' names in brackets."""
+def of_candidate(name: str, *, beside: bool = False) -> str:
+    """Return a hypothesis in words, its effects' names in brackets.
+
+    Parameters
+    ----------
+    name : str
+        ``none``, ``unknown``, or names of effects with ``+`` between them.
+    beside : bool
+        Whether something is named that no hypothesis has, as the samples or the operating point show it by themselves.
+    """
     if name in ("none", "unknown"):
-        return {"none": "nothing is missing", "unknown": "a cause outside the catalogue"}[name]
+        none = "nothing else is missing" if beside else "nothing is missing"
+        return {"none": none, "unknown": "a cause outside the catalogue"}[name]
     return joined([clause(one) for one in name.split("+")]) + f" ({name.replace('+', ' + ')})"

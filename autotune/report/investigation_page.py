@@ -7,6 +7,7 @@ import os
 from autotune.diagnosis.result import Diagnosis
 from autotune.pipeline.investigation import Investigation
 from autotune.report.diagnosis_page import write_diagnosis_page
+from autotune.report.effect_words import of_candidate, unit_of
 from autotune.report.page import Section, Table
 
 
@@ -22,17 +23,20 @@ def write_investigation_page(known: Investigation, found: Diagnosis, path: str |
     path : path
         File to write.
     """
-    write_diagnosis_page(found, path, before=(_rounds(known),))
+    write_diagnosis_page(found, path, before=(_rounds(known, found.search.units),), title="Investigation")
 
 
-def _rounds(known: Investigation) -> Section:
-    rows = [("0", "given recordings", "-", "-", _list_candidates(known.before))] if known.before else []
+def _rounds(known: Investigation, units: tuple[str, str]) -> Section:
+    rows = [("0", "given recordings", "-", "-", list_candidates(known.before, ""))] if known.before else []
     for one in known.rounds:
         excitation = one.plan.excitation
         asked = " against ".join(one.plan.between) or "what there is at all"
-        done = f"{excitation.kind} on the {excitation.on}, {excitation.amplitude:.3g}, {excitation.duration_s:.4g} s"
+        unit = unit_of(units[0] if excitation.on == "command" else units[1])
+        done = (
+            f"{excitation.kind} on the {excitation.on}, {excitation.amplitude:.3g}{unit}, {excitation.duration_s:.4g} s"
+        )
         expected = f"{one.plan.discrimination:.0f}" if one.plan.between else "-"
-        rows.append((str(one.number), done, asked, expected, _list_candidates(one.candidates)))
+        rows.append((str(one.number), done, asked, expected, list_candidates(one.candidates, one.verdict)))
     table = Table(
         header=("round", "experiment", "to tell", "expected chi-square", "probabilities after it"), rows=tuple(rows),
         caption="Expected chi-square: of one hypothesis where another is true, mean over the pairs.",
@@ -41,5 +45,15 @@ def _rounds(known: Investigation) -> Section:
     return Section(title="How it was learnt", text=(text,), tables=(table,) if rows else ())
 
 
-def _list_candidates(candidates: tuple[tuple[str, float], ...]) -> str:
-    return ", ".join(f"{name} {p:.2f}" for name, p in candidates[:3])
+def list_candidates(candidates: tuple[tuple[str, float], ...], verdict: str) -> str:
+    """Return the likeliest hypotheses in words, with their probabilities.
+
+    Parameters
+    ----------
+    candidates : tuple of (str, float)
+        Names and probabilities, the likeliest first.
+    verdict : str
+        Of the diagnosis that they are of.
+    """
+    beside = verdict == "effect" and bool(candidates) and candidates[0][0] == "none"
+    return ", ".join(f"{of_candidate(name, beside=beside)} {p:.2f}" for name, p in candidates[:3])

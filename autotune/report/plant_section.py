@@ -85,7 +85,7 @@ def numbers_table(fit: PlantFit, signals: SignalSettings) -> Table:
         values = [one[i][1] for one in drawn if len(one) > i and one[i][0] == name]
         told = len(values) > 0.9 * len(drawn) and fit.covariance.any()
         low, high = np.quantile(values, [0.025, 0.975]) if told else (math.nan, math.nan)
-        rows.append((_title(name, signals), f"{value:.4g}", f"{low:.4g} to {high:.4g}" if told else "not told"))
+        rows.append((_title(name, signals), f"{value:.4g}", f"{low:.4g} to {high:.4g}" if told else "not determined"))
     return Table(header=("fitted plant", "value", "95 %"), rows=tuple(rows))
 
 

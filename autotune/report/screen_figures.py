@@ -32,6 +32,9 @@ from autotune.report.page import BLUE, GREEN, GREY, ORANGE, Figure, Section, Tab
 
 #: Height of one screen's picture [px]; periods of the recomputed law that are drawn.
 HEIGHT, LAW_ROWS = 300, 600
+#: Signals that a controller makes, which answers the noise of y, and what is said of them then.
+_COMMANDS = ("command u", "u_applied")
+_ANSWERS = "in a closed loop the command answers the noise of y, so it need not be flat."
 #: Pieces in which a residual's size is drawn over time, and rows of one at least.
 PIECES, LEAST_PIECE = 80, 10
 
@@ -66,7 +69,11 @@ def _samples(found: Diagnosis, controller: Controller | None) -> Section:
         Figure(figure=taken, caption=f"Readings. {values.sentence}", height_px=HEIGHT),
     ]
     law = law_screen(recordings, controller)
-    text = () if law else ("No recording has a set-point r and a stated PI law: the law was not recomputed.",)
+    text = (
+        ()
+        if law
+        else ("There is no controller's law to check: that takes a set-point r, and the law in the sidecar or a file.",)
+    )
     if law is not None:
         figures.append(
             Figure(figure=_law(law, u_unit), caption=f"Control law recomputed. {law.sentence}", height_px=HEIGHT)
@@ -86,7 +93,7 @@ def _histogram(values: FloatArray, title: str, least: tuple[float, float], *, lo
 
 
 def _law(law: LawScreen, unit: str) -> go.Chart:
-    figure = lines_figure("t [s]", f"u [{unit}]")
+    figure = lines_figure("time [s]", f"u [{unit}]")
     near = slice(0, LAW_ROWS)
     add_line(figure, law.t[near], law.recorded[near], "recorded", GREY)
     add_line(figure, law.t[near], law.recomputed[near], "recomputed from r and y", BLUE)
@@ -183,7 +190,8 @@ def _signals(found: Diagnosis) -> Section:
     after = signals_of(search.chosen.fit, search.data)
     per_row = independent_share(search.retuned.fit)
     curves = {name: means_over(name, *before[name], per_row) for name in before}
-    best = max(curves, key=lambda name: curves[name].explained)
+    closed = any("r" in r.extra and np.isfinite(r["r"]).any() for r in search.recordings)
+    best = max((n for n in curves if not (closed and n in _COMMANDS)), key=lambda name: curves[name].explained)
     figures, rows = [], []
     for name, means in sorted(curves.items(), key=lambda pair: -pair[1].explained):
         figure = lines_figure(_title(name, found), f"residual [{found.search.units[1]}]")
@@ -194,7 +202,8 @@ def _signals(found: Diagnosis) -> Section:
             _add_means(figure, extended, "extended", BLUE, search.data.noise.total_sd)
             share = f"{100 * extended.explained:.1f} %"
         rows.append((name, f"{100 * means.explained:.1f} %", share))
-        caption = f"Mean residual over {name} with 95 % bands: flat at zero where nothing is missing."
+        caption = f"Mean residual over {name} with 95 % bands: "
+        caption += _ANSWERS if closed and name in _COMMANDS else "flat at zero where nothing is missing."
         figures.append(Figure(figure=figure, caption=caption, height_px=260))
     table = Table(header=("signal", "retuned", "extended"), rows=tuple(rows),
                   caption="Share of the residual's power that its mean over each signal explains.")  # fmt: skip
@@ -254,7 +263,7 @@ def trace_figures(found: Diagnosis, names: Sequence[str]) -> tuple[Figure, ...]:
     """
     figures, search = [], found.search
     for i, (r, name, count) in enumerate(zip(search.recordings, names, search.runs(), strict=True)):
-        figure = lines_figure("t [s]", f"y [{search.units[1]}]")
+        figure = lines_figure("time [s]", f"y [{search.units[1]}]")
         add_line(figure, *thinned(r.t, r.y), "measured", GREY, width=1.0)
         for model, simulated in search.simulated().items():
             add_line(figure, *thinned(r.t, simulated[i]), model, {"retuned": ORANGE, "extended": BLUE}[model])

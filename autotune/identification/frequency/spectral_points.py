@@ -98,7 +98,8 @@ def points_of_spectra(recording: Recording, largest_relative_sd: float) -> Frequ
             break
     if len(kept) < tried:
         notes.append(
-            f"{tried - len(kept)} of {tried} frequencies left out: known to less than {100 * largest_relative_sd:.0f} %"
+            f"{tried - len(kept)} of {tried} frequencies left out: the standard deviation of the response is above"
+            f" {100 * largest_relative_sd:.0f} % of the plant's gain"
         )
     if not kept:
         raise IdentificationError(

@@ -21,6 +21,7 @@ from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunct
 from autotune.report.chain_diagram import chain_diagram
 from autotune.report.diagnosis_page import write_diagnosis_page
 from autotune.report.effect_words import clause, joined, number, of_candidate, with_spread
+from autotune.report.investigation_page import list_candidates
 from autotune.report.law_figures import file_names
 from tests.autotune.diagnosis.servo_rigs import GAIN, servo_model, servo_recording
 
@@ -137,6 +138,13 @@ def test_rivals_are_told_in_words_with_their_names() -> None:
     assert said.startswith(clause("plant.coulomb_friction"))
     assert said.endswith("(plant.coulomb_friction + actuator.lag)")
     assert joined(["a", "b", "c"]) == "a, b and c"
+
+
+def test_beside_an_effect_that_no_hypothesis_has_nothing_else_is_missing() -> None:
+    left = (("none", 0.95), ("unknown", 0.03))
+    assert list_candidates(left, "effect").startswith("nothing else is missing 0.95")
+    assert list_candidates(left, "none").startswith("nothing is missing 0.95")
+    assert "nothing is missing 0.01" in list_candidates((("actuator.lag", 0.99), ("none", 0.01)), "effect")
 
 
 def test_recordings_of_one_file_name_are_told_apart_by_their_folders() -> None:
