@@ -12,7 +12,7 @@ from rich.console import Console
 from autotune.cli import app
 from autotune.cli.init_keys import REGISTER, Table, add_registers, register, set_keys
 from autotune.cli.init_model import EXAMPLE, ModelOfRig, model_of_rig
-from autotune.cli.init_questions import Questions, middle, one_of, pair
+from autotune.cli.init_questions import Questions, limits, middle, number, number_within, one_of, pair
 from autotune.cli.init_text import text_of
 from autotune.errors import InputError
 from autotune.outputs import Output
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from drivers.kinds import Kind
 
 Plant = Literal["ball", "servo", "two_tank", "thermal"]
+
+_RANGE = "lowest and highest {} the rig may see"
 
 #: samples of a sweep: some 15 to 40 a period, a few periods for each of five points, and the way there
 SWEEP_SAMPLES = 1e4
@@ -155,11 +157,6 @@ def init(
         asked = f"which plant: {', '.join(PLANTS)}, a model file, or a transfer function such as {EXAMPLE}"
         twin = questions.ask("--plant", twin, asked, _plant_or_model, suggested="ball")
         questions.require()
-    elif "twin" in chosen.settings.model_fields:
-        asked = f"the rig for rehearsals: a transfer function such as {EXAMPLE}, a model file, or nothing"
-        twin = questions.ask("--model", twin, asked, _plant_or_model, "") or None
-    if isinstance(twin, ModelOfRig):
-        twin.place(config)  # refused before anything is asked in vain
     answers: Table = {}
     if simulated and isinstance(twin, str):
         content = _simulated_config(twin)
@@ -170,17 +167,25 @@ def init(
         if registers and not chosen.has_registers:
             raise InputError(f'kind = "{chosen.name}" has no registers', where="--register", remedy="leave it out")
         add_registers(reached.get("registers", {}), registers or ())
+        if "twin" in chosen.settings.model_fields:
+            asked = f"a twin for --dry-run: a transfer function such as {EXAMPLE}, a model file, or Enter for none"
+            twin = questions.ask("--model", twin, asked, _plant_or_model, "") or None
+        if isinstance(twin, ModelOfRig):
+            twin.place(config)  # refused before more is asked in vain
         answers = {
             "u_unit": questions.ask("--u-unit", u_unit, "unit of the command u", str, ""),
             "y_unit": questions.ask("--y-unit", y_unit, "unit of the measurement y", str, ""),
-            "sample_time_s": questions.ask("--sample-time", sample_time, "control period [s]", float),
-            "u_range": questions.ask("--u-range", u_range, "lowest and highest command u the rig may see", pair),
-            "u_safe": questions.ask("--u-safe", u_safe, "command at which the rig may be left alone", float),
-            "y_range": questions.ask("--y-range", y_range, "lowest and highest measurement y it may see", pair),
+            "sample_time_s": questions.ask("--sample-time", sample_time, "control period [s], e.g. 0.1", number),
+            "u_range": questions.ask("--u-range", u_range, f"{_RANGE.format('command u')}, e.g. 0 100", limits),
         }
+        of_u = number_within(answers["u_range"])
+        answers["u_safe"] = questions.ask("--u-safe", u_safe, "command at which the rig may be left alone", of_u)
+        answers["y_range"] = questions.ask("--y-range", y_range, _RANGE.format("measurement y"), limits)
         centre = middle(answers["y_range"])  # y is chosen; what command holds it there is known to the person alone
-        answers["y"] = questions.ask("--y", y, "y of the operating point", float, suggested=centre)
-        answers["u"] = questions.ask("--u", u, "command that holds it there, about", float)
+        answers["y"] = questions.ask(
+            "--y", y, "y of the operating point", number_within(answers["y_range"]), suggested=centre
+        )
+        answers["u"] = questions.ask("--u", u, "command that holds it there, about", of_u)
         questions.require()
         played = _settings_of_twin(twin, config, answers)
         content = _real(reached | (played if simulated else {"twin": played} if played else {}), answers)

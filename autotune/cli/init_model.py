@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from autotune.errors import InputError
 from autotune.outputs import Output
 
 if TYPE_CHECKING:
@@ -81,8 +82,10 @@ def model_of_rig(answer: str) -> ModelOfRig:
     InputError
         It is neither a file nor a transfer function that can be read.
     """
-    if answer.endswith((".toml", ".fmu")) or os.path.isfile(answer):
+    if os.path.isfile(answer):
         return ModelOfRig(text=answer, dynamics=None)
+    if answer.endswith((".toml", ".fmu")):
+        raise InputError("no such file", where=answer, remedy="give its path from this folder")
     from autotune.equations.transfer_text import parse_transfer_function
 
     return ModelOfRig(text=answer.strip(), dynamics=parse_transfer_function(answer))

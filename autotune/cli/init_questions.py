@@ -104,8 +104,42 @@ def pair(answer: str) -> tuple[float, float]:
     """Return the two numbers of an answer."""
     parts = answer.replace(",", " ").split()
     if len(parts) != 2:
-        raise InputError(f"{answer!r}: two numbers are wanted", where="autotune init")
-    return float(parts[0]), float(parts[1])
+        raise InputError(f"{answer!r}: two numbers are wanted, such as 0 100", where="autotune init")
+    return number(parts[0]), number(parts[1])
+
+
+def limits(answer: str) -> tuple[float, float]:
+    """Return the two numbers of an answer, the lower one first."""
+    low, high = pair(answer)
+    if not low < high:
+        raise InputError(f"{answer!r}: the lowest is to be below the highest, such as 0 100", where="autotune init")
+    return low, high
+
+
+def number(answer: str) -> float:
+    """Return the number of an answer."""
+    try:
+        return float(answer)
+    except ValueError:
+        raise InputError(f"{answer!r} is no number, such as 0.1", where="autotune init") from None
+
+
+def number_within(limits: tuple[float, float] | None) -> Callable[[str], float]:
+    """Return what reads a number between two limits; any number where they are missing.
+
+    Parameters
+    ----------
+    limits : (float, float) or None
+        The lowest and the highest that is taken.
+    """
+
+    def read(answer: str) -> float:
+        value = number(answer)
+        if limits is not None and not limits[0] <= value <= limits[1]:
+            raise InputError(f"{value:g} is not within {limits[0]:g} to {limits[1]:g}", where="autotune init")
+        return value
+
+    return read
 
 
 def middle(limits: tuple[float, float] | None) -> str | None:

@@ -123,6 +123,8 @@ def _with_products(plain: str, text: str) -> str:
         if not found:
             raise _refused(text, f"{plain[at:].strip()[0]!r} has no meaning here")
         token, at = found[0].strip(), found.end()
+        if before[-1:].isdigit() and token[0] in ".0123456789":
+            raise _refused(text, f"no sign stands between the numbers {before} and {token}")
         if before not in ("", *"-+*/^(") and token not in "-+*/^)":
             if divides[-1]:
                 raise _refused(text, f"what stands behind the / before {token!r} is not clear: write brackets")

@@ -87,13 +87,14 @@ def test_every_kind_that_there_is_a_driver_for_can_be_described(tmp_path: Path) 
 
 def test_every_field_of_the_register_map_and_every_other_key_has_a_flag(tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
+    (tmp_path / "plant.toml").touch()
     registers = {name: f"holding:{10 + 2 * i}:uint16" for i, name in enumerate(RegisterMap.model_fields)}
     for name in ("y", "u", "gains", "unlock", "heartbeat_echo"):
         del registers[name]
     flags = [part for name, place in registers.items() for part in ("--register", f"{name}={place}")]
     flags += ["--register", "heartbeat_echo=input:40:int64,word_order=little,scale=1e-3"]
     flags += ["--set", 'rig.registers.unlock={ address = 90, type = "uint16", code = 4711 }', "--set", "rig.port=1502"]
-    flags += ["--set", "limits.u_rate=5", "--set", "audit_log=gains.jsonl", "--model", "plant.toml"]
+    flags += ["--set", "limits.u_rate=5", "--set", "audit_log=gains.jsonl", "--model", str(tmp_path / "plant.toml")]
     command("init", path, "--kind", "modbus_tcp", "--host", "10.0.0.2", *MODBUS, *REAL, *flags)
     config = load_config(path)
     assert isinstance(config.rig, ModbusTcpSettings)
@@ -105,7 +106,7 @@ def test_every_field_of_the_register_map_and_every_other_key_has_a_flag(tmp_path
     assert config.rig.registers.unlock is not None
     assert (config.rig.port, config.limits.u_rate, config.audit_log) == (1502, 5.0, "gains.jsonl")
     assert config.rig.twin is not None
-    assert config.rig.twin.model == "plant.toml"
+    assert config.rig.twin.model == str(tmp_path / "plant.toml")
 
 
 def test_gains_in_a_makers_form_bits_and_codes_have_flags(tmp_path: Path) -> None:
@@ -230,6 +231,23 @@ def test_limits_are_taken_with_comma_or_space_and_their_middle_is_suggested(limi
     assert content.operating_point.y == 50.0
 
 
+def test_an_answer_that_cannot_be_is_asked_for_again_at_once(tmp_path: Path) -> None:
+    reached = "modbus_tcp\nplc\ninput:0:float32\nholding:0:float32\n192.168.1.10\nnone.toml\n\n"
+    answers = f"{reached}%\nbar\nfast\n1\n100 0\n0 100\n-5\n0\n0 10\n20\n5\n30\n"
+    said, status = typed(["init", "plc.toml"], answers, tmp_path)
+    assert status == 0, said
+    refused = re.findall("Error: (.*)", said)
+    assert len(refused) == 6
+    assert "no sign stands between the numbers 192.168 and .1" in refused[0]
+    assert "no such file" in refused[1]
+    assert "'fast' is no number" in refused[2]
+    assert "the lowest is to be below the highest" in refused[3]
+    assert "-5 is not within 0 to 100" in refused[4]
+    assert "20 is not within 0 to 10" in refused[5]
+    content = load_config(tmp_path / "plc.toml")
+    assert (content.limits.u_max, content.operating_point.y, content.operating_point.u_guess) == (100.0, 5.0, 30.0)
+
+
 def test_a_transfer_function_as_it_is_written_becomes_the_model_of_twin_or_simulated_rig(tmp_path: Path) -> None:
     written = "-65.5/(s(0.36s+1)) e^-0.1s"
     command("init", tmp_path / "oven.toml", "--kind", "simulated", "--model", "K=2 T=10,2 L=0.5", *REAL)
@@ -260,7 +278,7 @@ def test_at_a_terminal_the_transfer_function_is_asked_for_until_it_can_be_read(t
     assert (tmp_path / "rig_model.toml").exists()
     said, status = typed(["init", "real.toml", "--kind", "serial", *SERIAL, *REAL], "1/(s+1)\n", tmp_path)
     assert status == 0, said
-    assert "the rig for rehearsals" in said
+    assert "a twin for --dry-run" in said
     assert read_model(tmp_path / "real_model.toml").name == "real: 1/(s+1)"
 
 
