@@ -93,8 +93,7 @@ def run(
         missed = tuning.verification is not None and not tuning.verification.accepted
         found = _diagnose(content, tuning, folder, console) if missed or diagnose else None
         recordings = [read_recording(folder / part.recording) for part in tuning.experiment.parts]
-        simulated = content.rig.kind == "simulated"
-        page = run_page(content.name, content.signals, recordings, tuning, found, simulated=simulated)
+        page = run_page(content.name, content.signals, recordings, tuning, found)
         write_page(page, folder / "report.html")
         for warning in (*tuning.experiment.warnings, *tuning.analysis.warnings):
             console.print(f"warning: {warning}", markup=False)

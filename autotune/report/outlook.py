@@ -141,7 +141,8 @@ def outlook_sentences(analysis: Analysis, present: PIDController | None = None) 
     before = None if present is None else _member("today", fit.plant, (), present, times, load)
     weight = _weight_text(designed, fit.plant, times, load)
     sentences = (*_gain_text(designed, before, "the gains before"), *weight)
-    return (" ".join(("By the fitted plant:", *sentences)),) if sentences else ()
+    said = " ".join(sentences)
+    return (f"On the fitted plant, {said[0].lower()}{said[1:]}",) if sentences else ()
 
 
 def _amount(value: float, unit: str) -> str:

@@ -29,8 +29,6 @@ def run_page(
     recordings: Sequence[Recording],
     tuning: Tuning,
     diagnosis: Diagnosis | None = None,
-    *,
-    simulated: bool = False,
 ) -> Page:
     """Return the page of a whole run on a rig.
 
@@ -46,10 +44,9 @@ def run_page(
         What the run ended with.
     diagnosis : Diagnosis, optional
         What the fitted plant leaves out; its own page is in ``diagnosis/report.html`` beside this one.
-    simulated : bool
-        Whether the rig is a simulated one, or its simulated twin took its place.
     """
     experiment, verification = tuning.experiment, tuning.verification
+    simulated = verification is not None and verification.by == "simulation"
     sections = []
     if verification is not None:
         tried = verification_section(verification, signals)
