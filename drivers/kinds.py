@@ -111,7 +111,13 @@ class Kind:
             The table ``[rig]``.
         session : Session
             What it is opened for.
+
+        Raises
+        ------
+        InputError
+            A file that is needed to reach it is not there.
         """
+        self._require_files(settings)
         rig: Rig = import_module(self.driver).open_kind(settings, session)
         return rig
 
@@ -138,7 +144,7 @@ class Kind:
         Raises
         ------
         InputError
-            The driver has no means to.
+            The driver has no means to, or lacks a file for it.
         LinkError
             Nobody answers.
         """
@@ -149,7 +155,18 @@ class Kind:
                 where="rig",
                 remedy="autotune doctor CONFIG.toml says whether it can be reached",
             )
+        self._require_files(settings)
         return look(settings, expected)
+
+    def _require_files(self, settings: Section) -> None:
+        """Refuse before anything is made for a session that cannot begin."""
+        for file in self.reached_by(settings).files:
+            if not Path(file).is_file():
+                raise InputError(
+                    "no such file",
+                    where=file,
+                    remedy="give its path as seen from this folder; certificates: docs/modbus_tls.md, docs/opcua.md",
+                )
 
 
 KINDS = (

@@ -304,10 +304,6 @@ class OpcUaLink:
         settings = self._settings
         client = Client(settings.endpoint, timeout=settings.timeout_s, watchdog_intervall=3600.0)
         client.name = client.description = "autotune"
-        for name in ("cert_file", "key_file", "server_cert_file", "password_file"):
-            file = getattr(settings, name)
-            if file is not None and not Path(file).is_file():
-                raise InputError("no such file", where=file, remedy=f"give rig.{name}; docs/opcua.md makes them")
         if settings.cert_file is not None:
             client.application_uri = _application_uri(Path(settings.cert_file)) or client.application_uri
         if settings.user is not None and settings.password_file is not None:

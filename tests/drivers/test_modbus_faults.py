@@ -14,6 +14,7 @@ import pytest
 from autotune.config.registers import RegisterMap
 from autotune.errors import InputError, LinkError
 from autotune.experiment.rig import Rig
+from drivers import open_rig
 from drivers.modbus import DeviceRefused, ModbusLink
 from sim.modbus_rig import ModbusRig, RtuTransport, TcpTransport
 from sim.plant import Plant
@@ -407,8 +408,12 @@ def test_a_device_with_another_authoritys_certificate_or_name_is_refused(certifi
         with pytest.raises(LinkError):
             stranger.open()
         stranger.close()
-        with pytest.raises(InputError, match="no such certificate"):
-            rig_of(tls_settings(server.port, certificates, key_file=str(tmp_path / "none.key"))).open()
+        with pytest.raises(InputError, match=r"none\.key: no such file"):
+            open_rig(
+                tls_settings(server.port, certificates, key_file=str(tmp_path / "none.key")),
+                u_range=(0.0, 1.0),
+                u_safe=0.0,
+            )
         assert device.output == pytest.approx(0.1)  # nobody has moved anything
 
 
