@@ -198,25 +198,25 @@ class FmuSimulation:
         """Run a co-simulation FMU: its own solver from row to row, inputs held."""
         is_3 = str(self._description.fmiVersion).startswith("3.")
         slave = self._opened(is_3)
-        t0, references = float(drive.t[0]), self._references
+        references = self._references
         if not is_3:
             slave.setupExperiment(startTime=0.0)
         set_values = slave.setFloat64 if is_3 else slave.setReal
         get_values = slave.getFloat64 if is_3 else slave.getReal
         if parameters:
             set_values([references[n] for n in parameters], [float(v) for v in parameters.values()])
-        inputs = [references[name] for name in self._variables]
-        set_values(inputs, [float(v) for v in drive.inputs[0]])
+        inputs, output = [references[name] for name in self._variables], [references[self._value]]
+        wanted, begins, lengths = drive.inputs.tolist(), (drive.t - drive.t[0]).tolist(), np.diff(drive.t).tolist()
+        set_values(inputs, held := wanted[0])
         slave.enterInitializationMode()
         slave.exitInitializationMode()
-        y, output = np.full(drive.t.size, np.nan), [references[self._value]]
-        for k in range(drive.t.size):
-            y[k] = get_values(output)[0]
-            if k + 1 < drive.t.size:
-                set_values(inputs, [float(v) for v in drive.inputs[k]])
-                now = float(drive.t[k]) - t0
-                slave.doStep(currentCommunicationPoint=now, communicationStepSize=float(drive.t[k + 1] - drive.t[k]))
-        return y
+        y = get_values(output)
+        for values, begin, length in zip(wanted, begins, lengths, strict=False):  # no step follows the last row
+            if values != held:  # an FMU keeps its inputs, and a call takes as long as a step
+                set_values(inputs, held := values)
+            slave.doStep(currentCommunicationPoint=begin, communicationStepSize=length)
+            y += get_values(output)
+        return np.array(y, dtype=np.float64)
 
     def _opened(self, is_3: bool) -> Any:
         """Return the FMU reset, instantiated on first use."""

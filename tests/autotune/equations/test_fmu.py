@@ -80,7 +80,7 @@ def test_an_fmu_is_diagnosed_from_the_command_line(tmp_path: Path, fmi: int) -> 
     build(folder, fmi=fmi)
     (folder / "m.toml").write_text(MODEL)
     for seed in (2, 3):
-        write_recording(recorded(seed, J=0.06, high=0.6), tmp_path / f"rec{seed}.csv")
+        write_recording(recorded(seed, J=0.06, high=0.6, rows=300), tmp_path / f"rec{seed}.csv")
     run = CliRunner().invoke(
         app,
         ["diagnose", "--model", str(folder / "m.toml"), str(tmp_path / "rec2.csv"), str(tmp_path / "rec3.csv"),
