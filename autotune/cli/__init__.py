@@ -5,6 +5,7 @@ from __future__ import annotations
 import _thread
 import contextlib
 import errno
+import os
 import signal
 import sys
 import warnings
@@ -137,6 +138,10 @@ def main() -> None:
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, raise_interrupt)
     sys.unraisablehook = _unraisable
+    # Threads wait for each other on small matrices longer than they work, the more the busier the machine is, and add
+    # up in another order. The libraries read this when numpy is imported, which is later; what the user says stands.
+    for name in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
+        os.environ.setdefault(name, "1")
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # numpy's remarks are not for the user: results are checked for what they are
     try:

@@ -127,7 +127,6 @@ def diagnose(
         )  # fmt: skip
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-    from threadpoolctl import threadpool_limits
 
     from autotune.controller import read_controller
     from autotune.diagnosis.diagnose import diagnose as find
@@ -145,8 +144,7 @@ def diagnose(
     law = None if controller is None else read_controller(controller)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     announce_compiling()
-    # many short products: waiting for each other costs linear algebra's threads more than they save
-    with threadpool_limits(1), Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("diagnosing", total=1.0)
         found = with_next_experiment(
             find(

@@ -145,7 +145,6 @@ def closed_loop(
     """Figures 2 to 5 of Pouliquen et al.: poles by each method and the noise models, on the paper's example."""
     import numpy as np
     from rich.progress import track
-    from threadpoolctl import threadpool_limits
 
     from autotune.api.examples import LOOP_NOISE, LOOP_PLANT, example
     from autotune.identification.closed_loop.confidence import pole_covariance
@@ -158,13 +157,12 @@ def closed_loop(
     models: dict[str, list[InnovationModel]] = {title: [] for title in _DRAWN}
     truth = from_polynomials(*LOOP_PLANT, LOOP_NOISE, variance=1.0 / 9.0)
     squares = []
-    with threadpool_limits(1):
-        for seed in track(range(sets), description="data sets", transient=True):
-            data = example("loop", seed=seed)
-            _estimate(data, models)
-            at_truth = prediction_error(truth, data.u[:, None], data.y[:, None], offset=False, max_iterations=0)
-            of_poles = np.trace(pole_covariance(at_truth), axis1=1, axis2=2)[truth.poles.imag >= 0.0]
-            squares.append(of_poles * (1.0 - at_truth.parameters / at_truth.rows))
+    for seed in track(range(sets), description="data sets", transient=True):
+        data = example("loop", seed=seed)
+        _estimate(data, models)
+        at_truth = prediction_error(truth, data.u[:, None], data.y[:, None], offset=False, max_iterations=0)
+        of_poles = np.trace(pole_covariance(at_truth), axis1=1, axis2=2)[truth.poles.imag >= 0.0]
+        squares.append(of_poles * (1.0 - at_truth.parameters / at_truth.rows))
     bound = np.sqrt(np.mean(squares, axis=0))
     place.by(lambda part: write_page(loop_page(models, truth, sets, bound), part))
     found = ", ".join(f"{title} {len(every)}" for title, every in models.items())

@@ -42,7 +42,6 @@ def look_at(
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-    from threadpoolctl import threadpool_limits
 
     from autotune.diagnosis.routine import diagnose_routine
     from autotune.report.routine_page import write_routine_page
@@ -56,7 +55,7 @@ def look_at(
     data = read_all(recordings, names)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     announce_compiling()
-    with threadpool_limits(1), Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task("looking", total=1.0)
         found = diagnose_routine(
             data, progress=lambda what, share: progress.update(task, description=what, completed=share)

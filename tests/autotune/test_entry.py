@@ -110,3 +110,28 @@ except KeyboardInterrupt:
     given = [sys.executable, "-c", program]
     ended = subprocess.run(given, capture_output=True, text=True, env=environment, timeout=40, check=False)
     assert (ended.returncode, ended.stderr, ended.stdout) == (0, "", f"{lasts_s == 0.0}\n")
+
+
+@pytest.mark.parametrize(("said", "kept"), [(None, "1"), ("3", "3")])
+def test_a_command_keeps_linear_algebra_on_one_thread_unless_it_is_told_otherwise(said: str | None, kept: str) -> None:
+    """On two busy processors an exponential of three states took 12 ms for .07, and a run twice its time."""
+    program = """
+import os, sys
+sys.argv = ["autotune", "--version"]
+from autotune.entry import main
+try:
+    main()
+except SystemExit:
+    pass
+import scipy.linalg
+from threadpoolctl import threadpool_info
+print(os.environ["OPENBLAS_NUM_THREADS"], max(one["num_threads"] for one in threadpool_info()))
+"""
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    environment |= {} if said is None else {"OPENBLAS_NUM_THREADS": said}
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, env=environment, timeout=120, check=True
+    )
+    set_to, used = ended.stdout.split()[-2:]
+    assert set_to == kept
+    assert said is not None or used == "1"
