@@ -22,7 +22,9 @@ types: $(VENV)/.test
 imports: $(VENV)/.test
 	$(BIN)/lint-imports
 
-# each kernel is compiled once, where every worker of a fresh clone would compile them all
+# Each kernel is compiled once, where every worker of a fresh clone would compile them all. Bytecode is kept even where
+# the environment says not to: each of some hundred processes would compile the sources anew.
+unit: export PYTHONDONTWRITEBYTECODE =
 unit: $(VENV)/.test
 	$(BIN)/python -m tests.compile_kernels
 	$(BIN)/pytest -n auto --durations 30

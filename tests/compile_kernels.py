@@ -47,6 +47,24 @@ def compile_run() -> None:
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder)
 
 
+def compile_identification() -> None:
+    """Identify a loop, and a dead time row by row."""
+    import autotune as at
+
+    record = _record()
+    r = np.repeat(np.random.default_rng(1).choice([-1.0, 1.0], 20), 10)
+    loop = at.example("loop")
+    at.closed_loop(loop, 2)
+    at.delay({**record, "u": r, "y": np.convolve(r, np.exp(-0.1 * np.arange(200)))[:200]}, 1, method="online")
+
+
+def compile_diagnosis() -> None:
+    """Diagnose a chain."""
+    import autotune as at
+
+    at.diagnose(at.Model.from_text("1.8/(0.6s + 1)"), _record())
+
+
 def _record() -> dict[str, np.ndarray]:
     t = 0.05 * np.arange(200)
     return {"t": t, "u": np.ones(200), "y": 2.0 * (1.0 - np.exp(-t / 0.5))}
@@ -54,8 +72,9 @@ def _record() -> dict[str, np.ndarray]:
 
 def main() -> None:
     """Do all of them, as many at a time as there are processors in the smallest machine; the longest first."""
+    every = (compile_equations, compile_identification, compile_run, compile_diagnosis, compile_chain)
     with ProcessPoolExecutor(PROCESSORS, mp_context=multiprocessing.get_context("spawn")) as pool:
-        for done in [pool.submit(kernels) for kernels in (compile_equations, compile_run, compile_chain)]:
+        for done in [pool.submit(kernels) for kernels in every]:
             done.result()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ import autotune as at
 from autotune.batch.loop import Work, analyse_loop
 from autotune.batch.settings import CampaignSettings, LoopSettings
 from autotune.config.procedure import DesignSettings
-from autotune.controller import read_controller
+from autotune.controller import PIDController, read_controller
 from autotune.design.margins import margins
 from autotune.errors import IdentificationError
 from autotune.identification.dependence import require_answer
@@ -25,18 +27,33 @@ from tests.benchmarks.front_door import best, load_error, tuned
 FILES = {door.name: door for door in DOORS}
 
 
+@pytest.fixture(scope="module")
+def by_command(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], tuple[Path, PIDController]]:
+    """Return what calls `autotune tune` on a file of a name, once, and returns the file and the controller."""
+
+    @cache
+    def tune(name: str) -> tuple[Path, PIDController]:
+        folder = tmp_path_factory.mktemp("door")
+        FILES[name].write(folder / name)
+        found = tuned(folder / name, folder / "out")
+        assert not isinstance(found, str), found
+        return folder / name, found
+
+    return tune
+
+
 @pytest.mark.parametrize(
     ("name", "worst"),
     # what the closed loop's record holds costs 1.14 to 1.17 with the plant's order and the noise's colour given
     [("oven_step.csv", 1.1), ("doublet.csv", 1.1), ("inverse.csv", 1.1), ("closed_loop.csv", 1.2)],
 )
-def test_a_recording_goes_to_a_controller_with_margins_near_the_best(name: str, worst: float, tmp_path: Path) -> None:
+def test_a_recording_goes_to_a_controller_with_margins_near_the_best(
+    name: str, worst: float, by_command: Callable[[str], tuple[Path, PIDController]]
+) -> None:
     door = FILES[name]
-    door.write(tmp_path / name)
-    found = tuned(tmp_path / name, tmp_path / "out")
-    assert not isinstance(found, str), found
-    written = read_controller(tmp_path / "out" / "controller.toml")
-    assert written == found == read_controller(tmp_path / "out")
+    file, found = by_command(name)
+    written = read_controller(file.parent / "out" / "controller.toml")
+    assert written == found == read_controller(file.parent / "out")
     kept = margins(door.plant, found)
     assert kept.modulus > 0.495
     assert kept.phase_rad > np.radians(44.5)
@@ -56,11 +73,10 @@ def test_a_recording_goes_to_a_controller_with_margins_near_the_best(name: str, 
         ("milliseconds.parquet", ("valve", "temperature", "")),
     ],
 )
-def test_tune_batch_and_python_give_the_same_gains(name: str, columns: tuple[str, str, str], tmp_path: Path) -> None:
-    file = tmp_path / name
-    FILES[name].write(file)
-    found = tuned(file, tmp_path / "out")
-    assert not isinstance(found, str), found
+def test_tune_batch_and_python_give_the_same_gains(
+    name: str, columns: tuple[str, str, str], by_command: Callable[[str], tuple[Path, PIDController]]
+) -> None:
+    file, found = by_command(name)
     u, y, r = columns
     work = Work(loop=LoopSettings(name="a", file=str(file), u=u, y=y, r=r), settings=CampaignSettings(name="all"))
     row = analyse_loop(work).row
