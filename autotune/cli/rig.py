@@ -120,7 +120,7 @@ def _print_verdict(console: Console, what: str, warnings: Mapping[str, Sequence[
         for warning in said:
             console.print(f"{name}: {warning}", markup=False)
     implausible = [name for name, said in warnings.items() if said]
-    verdict = f"{', '.join(implausible)} look implausible" if implausible else "all values are plausible"
+    verdict = f"not plausible: {', '.join(implausible)}" if implausible else "all values are plausible"
     console.print(f"{what} read, nothing written: {verdict}", markup=False)
 
 

@@ -15,6 +15,7 @@ from autotune.identification.sweep_adequacy import TESTS
 from autotune.identification.sweep_estimate import LEVEL
 from autotune.recording import Recording
 from autotune.report.chart import Chart, make_subplots
+from autotune.report.effect_words import number
 from autotune.report.figures import axis_title, recording_figure
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Section, Table, add_line, thinned
 
@@ -35,9 +36,9 @@ def experiment_section(
     """
     timing, parts = experiment.timing, experiment.parts
     figures = []
-    for number, (recording, part) in enumerate(zip(recordings, parts, strict=True)):
-        marks = [(s.start_s, f"{i + 1}") for i, s in enumerate(experiment.segments) if s.part == number]
-        which = "The whole recording." if len(parts) == 1 else f"Sitting {number + 1}, {part.recording}."
+    for sitting, (recording, part) in enumerate(zip(recordings, parts, strict=True)):
+        marks = [(s.start_s, f"{i + 1}") for i, s in enumerate(experiment.segments) if s.part == sitting]
+        which = "The whole recording." if len(parts) == 1 else f"Sitting {sitting + 1}, {part.recording}."
         figures.append(
             Figure(
                 figure=recording_figure(recording, signals.u_unit, signals.y_unit, marks=marks),
@@ -59,7 +60,7 @@ def experiment_section(
             f" {signals.u_unit}; the measurement's noise has a standard deviation of {experiment.noise_sd:.3g}"
             f" {signals.y_unit}.",
             *_together_text(experiment),
-            f"It ended because: {experiment.reason}; {sentence(experiment.output)}.",
+            f"The sweep {_how_it_ended(experiment.reason)}; {sentence(experiment.output)}.",
             f"Link latency {_milliseconds(timing.latency_s)}, lateness of the loop {_milliseconds(timing.lateness_s)},"
             f"{_decision(timing.decision_s)}"
             f" (median, 99 %, worst); {timing.missed} sample(s) missed, {timing.unusable} unusable.",
@@ -98,7 +99,7 @@ def _dwell_table(experiment: ExperimentResult) -> Table:
         cells = (f"{i}", f"{math.degrees(one.phase_rad):.0f}", f"{one.point.omega_rad_s:.3g}", f"{one.periods}", dwell)
         known = 100 * relative_sd(one)
         further = known * math.sqrt(one.periods / (one.periods + 1))
-        rows.append((*cells, f"{known:.2g} %", f"{further:.2g} %"))
+        rows.append((*cells, f"{number(known, 2)} %", f"{number(further, 2)} %"))
     header = ("cycle", "aimed at [deg]", "ω [rad/s]", "periods", "dwell [s]", "its own rows know its point to",
               "one period more, to")  # fmt: skip
     return Table(header=header, rows=tuple(rows))
@@ -109,8 +110,12 @@ def _decision(values: tuple[float, float, float]) -> str:
     return f" from a reading to its command {_milliseconds(values)}" if math.isfinite(values[0]) else ""
 
 
+def _how_it_ended(reason: str) -> str:
+    return "came to its end" if reason == "completed" else f"was ended: {reason}"
+
+
 def _milliseconds(values: tuple[float, float, float]) -> str:
-    return " / ".join(f"{1e3 * value:.2g}" for value in values) + " ms"
+    return " / ".join(number(1e3 * value, 2) for value in values) + " ms"
 
 
 _CYCLE_COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, GREY)

@@ -20,6 +20,7 @@ from autotune.models import TransferFunction
 from autotune.pipeline import Analysis
 from autotune.pipeline.one_thread import on_one_thread
 from autotune.report.chart import Chart, make_subplots
+from autotune.report.effect_words import number
 from autotune.report.figures import axis_title, ratio_title
 from autotune.report.page import BLUE, GREY, ORANGE, Figure, Section, Table, add_line
 
@@ -185,7 +186,7 @@ def _gain_text(designed: Member, before: Member | None, name: str) -> tuple[str,
     if before is None or not before.kept.stable:
         return ()
     now, then = (float(np.sum(np.abs(one.prediction.y[_SAMPLES:] - 1.0))) for one in (designed, before))
-    times = f"{then / now:.2g} times smaller" if then > now else f"{now / then:.2g} times larger"
+    times = f"{number(then / now, 2)} times smaller" if then > now else f"{number(now / then, 2)} times larger"
     return (f"The integral of the error that a load leaves is {times} than with {name}.",)
 
 

@@ -12,6 +12,7 @@ from autotune.arrays import FloatArray
 from autotune.config.procedure import SignalSettings
 from autotune.pipeline import Analysis
 from autotune.points import FrequencyPoint
+from autotune.report.effect_words import number
 from autotune.report.figures import (
     Curve,
     bode_figure,
@@ -145,7 +146,7 @@ def _points_table(points: Sequence[FrequencyPoint], sign: int, gain_unit: str) -
     for point, phase in zip(points, phases, strict=True):
         sd = math.sqrt(np.trace(np.array(point.covariance)) / 2.0) / point.gain
         cells = (f"{point.omega_rad_s:.4g}", f"{point.gain:.5g}", f"{phase:.2f}")
-        rows.append((*cells, f"{100 * 1.96 * sd:.2g} %", f"{math.degrees(1.96 * sd):.2g}", point.source))
+        rows.append((*cells, f"{number(196 * sd, 2)} %", number(math.degrees(1.96 * sd), 2), point.source))
     gain = f"gain [{gain_unit}]" if gain_unit else "gain"
     header = ("ω [rad/s]", gain, "phase [deg]", "gain ±95 %", "phase ±95 % [deg]", "kind")
     return Table(header=header, rows=tuple(rows))

@@ -246,7 +246,7 @@ def _diagnosis_section(found: Diagnosis) -> Section:
         ),
     )
     return Section(
-        title="Why it differs",
+        title="What the fitted plant leaves out",
         text=tuple(text),
         links=(("The whole diagnosis, with its pictures", "diagnosis/report.html"),),
         tables=(effects,) if found.effects else (),

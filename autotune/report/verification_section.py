@@ -48,7 +48,7 @@ def verification_section(verification: Verification, signals: SignalSettings) ->
             Table(
                 header=("", "measured", "predicted", "predicted scatter (sd)"),
                 rows=tuple(
-                    (name, *(f"{value:.3g}" if math.isfinite(value) else "-" for value in values))
+                    (name, *(f"{round(value, 12):.3g}" if math.isfinite(value) else "-" for value in values))
                     for name, *values in rows
                     if any(map(math.isfinite, values))
                 ),
