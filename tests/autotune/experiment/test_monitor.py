@@ -106,3 +106,20 @@ def test_a_sensor_that_jumps_while_samples_are_lost_is_still_one(lost: int) -> N
     readings = [Reading(t_s=k * T_S, y=5.0 if k < 10 else 5.0 + 1.1 * one.jump * (1 + lost / RECENT))
                 for k in (*range(10), *range(10 + lost, 30 + lost))]  # fmt: skip
     assert stopped_after(one, readings)[1] < 20
+
+
+def test_a_plant_that_turns_within_few_samples_is_no_jump_of_the_sensor() -> None:
+    """Eight samples a period, the fewest that a link supports, and the relay's triangle nearly as wide as the swing."""
+    one = monitor()
+    one.jump = 1.5  # half of the swing
+    period = [0.0, 1.2, 2.4, 1.2, 0.0, -1.2, -2.4, -1.2]
+    assert all(one.judge(Reading(t_s=k * T_S, y=y), 0.0)[1] for k, y in enumerate(5 * period))
+
+
+def test_one_wild_reading_does_not_make_the_next_good_one_wild() -> None:
+    one = monitor()
+    one.jump = 1.5
+    said = [
+        one.judge(Reading(t_s=k * T_S, y=y), 0.0)[1] for k, y in enumerate([0.0] * 6 + [1.4, 0.0, 9.0, -1.4, 0.0, 1.6])
+    ]
+    assert said == [True] * 8 + [False, True, True, False]
