@@ -71,7 +71,7 @@ SENSOR = (
         parameters=(Quantity(name="time_constant", unit="s", role="amplitude"),),
         linear=LinearPart(blocks=_with_lag, states=1, start=_last_outputs),
         starts=lambda s: [(c * s.lag_s,) for c in (0.05, 0.25)],
-        same=("actuator.lag",),
+        same=("actuator.lag", "timing.dead_time"),
         recoordinates=True,
         places=("sensor", "actuator", "plant"),
         odds=lacking(usual="any", possible="damper"),
