@@ -16,6 +16,7 @@ from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.descent import Iterate, Problem, eliminate, step_of, try_point
 from autotune.diagnosis.fitting.fit import Fit
+from autotune.diagnosis.fitting.long_windows import spread_of
 
 #: Stretches that are left out, one after the other.
 STRETCHES = 8
@@ -24,9 +25,8 @@ STRETCHES = 8
 HEAD, LARGE_HEAD, LEAST_HEAD = 0.12, 0.35, 8
 #: Steps of the numbers that each left-out stretch is worth, with the derivatives of the fit to all.
 STEPS = 3
-#: Ratio of errors on one stretch that counts at most: where one runs away, how far does not matter.
+#: Spreads of y that an error counts as at most: where a simulation runs away, how far does not matter.
 FAR_OFF = 10.0
-TINY = 1e-300
 
 
 def stretches_of(data: Data) -> list[IntArray]:
@@ -73,7 +73,7 @@ def held_out_squares(result: Fit, data: Data) -> FloatArray:
     Returns
     -------
     (STRETCHES,) array
-        In the reading's unit squared; infinite where a simulation runs away.
+        In the reading's unit squared; as of errors of ten spreads of y where a simulation runs away.
 
     Notes
     -----
@@ -81,10 +81,13 @@ def held_out_squares(result: Fit, data: Data) -> FloatArray:
     window's first rows say of its start state is always known. With thresholds that is first order: a stretch on which
     a threshold alone was felt is judged a little too well.
     """
-    squares = np.full(STRETCHES, math.inf)
+    labels, good = np.concatenate(stretches_of(data)), np.concatenate(data.good)
+    judged = np.array([np.sum(good & (labels == k)) for k in range(STRETCHES)])
+    most = judged * (FAR_OFF * spread_of(data)) ** 2
+    squares = most.copy()
     for k, out, there, _ in _left_out(result, data):
-        squares[k] = float(there.e[out] @ there.e[out])
-    return squares * data.noise.sd**2
+        squares[k] = min(float(there.e[out] @ there.e[out]) * data.noise.sd**2, most[k])
+    return squares
 
 
 def error_beside_still(result: Fit, data: Data) -> float | None:
@@ -157,26 +160,6 @@ def _without(
             break
         at = moved
     return at
-
-
-def reduction(squares: FloatArray, other: FloatArray) -> float:
-    """Return the logarithm of how many times smaller the other model's mean squared error is.
-
-    Parameters
-    ----------
-    squares, other : (K,) array
-        Squared errors of both on the same stretches.
-
-    Returns
-    -------
-    float
-        Of all stretches together and as a mean of each one's, the one nearer to 0; 0 where they do not agree on the
-        sign.
-    """
-    first, second = (np.minimum(each, FAR_OFF**2 * np.minimum(squares, other)) + TINY for each in (squares, other))
-    together = math.log(float(np.sum(squares) + TINY) / float(np.sum(other) + TINY))
-    each = float(np.mean(np.log(first / second)))
-    return min((together, each), key=abs) if together * each > 0.0 else 0.0
 
 
 def correlation_rows(result: Fit, data: Data) -> float:

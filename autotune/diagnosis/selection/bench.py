@@ -106,7 +106,7 @@ class Bench:
             return None
         if rms(result.residuals, self.long.good) >= rms(one.fit.residuals, self.long.good):
             return None
-        return bench.finite(result, one.log_odds)
+        return bench.judged(result, one.log_odds)
 
     def _at(self, sd: float) -> Bench:
         """Return the bench at another residual of long windows, that of short ones in proportion."""
@@ -152,11 +152,6 @@ class Bench:
             short_squares=held_out_squares(short, self.few) if self.two_scales else squares,
             log_odds=log_odds,
         )
-
-    def finite(self, result: Fit, log_odds: float) -> JudgedChain | None:
-        """Return a fit judged like :meth:`judged`; nothing where its errors on left-out stretches are not finite."""
-        judged = self.judged(result, log_odds)
-        return judged if judged is not None and np.all(np.isfinite(judged.long_squares)) else None
 
 
 def residual_sd(result: Fit, data: Data) -> float:

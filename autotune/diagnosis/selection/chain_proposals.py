@@ -110,7 +110,7 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
         order = sorted(best.values(), key=lambda one: one[0].cost - 2.0 * one[1])
         able = [[one for one in order if one[2] is base][: self.limits.rig_tried] for base in beam]
         done = self.pool.map(lambda one: self.judged(one[0], one[1]), [one for group in able for one in group])
-        return [j for j in done if j is not None and np.all(np.isfinite(j.long_squares + j.short_squares))]
+        return [j for j in done if j is not None]
 
     def beside(self, best: JudgedChain) -> _ChainProposals:
         """Return what proposes beside a hypothesis, in units of the residual that it leaves."""
@@ -120,7 +120,7 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
         """Return a hypothesis that was fitted to more rows, fitted to these from its numbers; None if it runs away."""
         try:
             there = fit_from(one.fit.parametrisation, self.long, one.fit.theta, iterations=LAST_STEPS)
-            return self.finite(there, one.log_odds)
+            return self.judged(there, one.log_odds)
         except RUNAWAY:
             return None
 
@@ -203,7 +203,7 @@ def _fit_from_best(best: JudgedChain, larger: JudgedChain, bench: Bench) -> Judg
         return None
     if result.cost >= larger.fit.cost:
         return None
-    return bench.finite(result, larger.log_odds)
+    return bench.judged(result, larger.log_odds)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,15 +10,20 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from statistics import fmean
+from functools import cached_property
 from typing import Self, TypeVar
 
+import numpy as np
+
 from autotune.arrays import FloatArray
-from autotune.diagnosis.evidence.stretches import STRETCHES, reduction
+from autotune.diagnosis.evidence.stretches import STRETCHES
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import called
 from autotune.models import Effect
+
+#: Added to squared errors, for a stretch without rows has none.
+TINY = 1e-300
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,10 +108,10 @@ class Judged(ABC):
         """Return it with all rows of the recordings, where it was fitted to a part of them."""
         return self
 
-    @property
+    @cached_property
     def log_squares(self) -> float:
-        """Logarithm of its squared errors on left-out stretches, the mean of both scales."""
-        return 0.5 * math.log(float(self.long_squares.sum()) * float(self.short_squares.sum()))
+        """Logarithm of its squared errors, the mean of all left-out stretches and of both scales."""
+        return float(np.mean(np.log(np.concatenate([self.long_squares, self.short_squares]) + TINY)))
 
     def behind(self, other: Judged) -> float:
         """Return twice the logarithm of the odds that another hypothesis is the better one, priors counted.
@@ -137,21 +142,17 @@ class Judged(ABC):
         """Return what stretches that were left out say for another hypothesis, cooled as rows are.
 
         A stretch is one witness of the model's own error, as a row is of noise: errors that are normal, independent
-        from stretch to stretch and of a size that is not known give K ln(S1/S2) for the squared errors S of K
-        stretches. Long windows and short ones are two measurements of the same, and count as their mean.
+        from stretch to stretch and of a size that each stretch has for itself give K times the mean of ln(S1/S2) for
+        the squared errors S on K stretches. Long windows and short ones are two measurements of the same, and count as
+        their mean.
         """
-        scales = ((self.long_squares, other.long_squares), (self.short_squares, other.short_squares))
-        return STRETCHES * fmean(reduction(*pair) for pair in scales) / self.limits.temperature
+        return STRETCHES * (self.log_squares - other.log_squares) / self.limits.temperature
 
     def is_better(self, other: Judged, share: float) -> bool:
-        """Whether it takes a share of another one's held-out error away, at one of the scales.
-
-        Near the noise whatever rows speak for is better.
-        """
+        """Whether it takes a share of another one's held-out error away; near the noise, whether rows speak for it."""
         if self.leaves_noise or other.leaves_noise:
             return other.behind(self) > 0.0
-        scales = ((self.long_squares, other.long_squares), (self.short_squares, other.short_squares))
-        return min(math.sqrt(float(mine.sum() / its.sum())) for mine, its in scales) < 1.0 - share
+        return math.exp(0.5 * (self.log_squares - other.log_squares)) < 1.0 - share
 
 
 _J = TypeVar("_J", bound=Judged)

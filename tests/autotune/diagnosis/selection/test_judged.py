@@ -22,6 +22,7 @@ GRAVITY, DRY, CURVED, DROPPING = (
 #: Errors on eight stretches, about 1.
 ERRORS = np.array([0.9, 1.1, 1.0, 0.95, 1.05, 1.02, 0.98, 1.0])
 SIZES = st.floats(0.4, 3.5)
+SQUARES = st.lists(st.floats(0.01, 100.0), min_size=8, max_size=8)
 
 
 def hypothesis_of(names: tuple[str, ...], size: float, log_odds: float = 0.0, short: float | None = None) -> Astray:
@@ -40,10 +41,20 @@ def test_stretches_count_as_rows_do(a: float, b: float, c: float, d: float) -> N
     assert other.behind(one) == pytest.approx(-expected, abs=1e-9)
 
 
-@given(st.lists(st.tuples(SIZES, st.floats(-5.0, 5.0)), min_size=3, max_size=3))
-def test_what_beats_one_that_beats_another_beats_that(three: list[tuple[float, float]]) -> None:
-    first, second, third = (hypothesis_of((), size, log_odds) for size, log_odds in three)
+@given(st.lists(st.tuples(SQUARES, st.floats(-5.0, 5.0)), min_size=3, max_size=3), st.floats(1e-3, 1e3))
+def test_what_beats_one_that_beats_another_beats_that_in_any_unit(
+    three: list[tuple[list[float], float]], unit: float
+) -> None:
+    """Each stretch has a size of error of its own: what they say adds up, whatever y is measured in."""
+
+    def each(scale: float) -> list[Astray]:
+        known = ((scale**2 * np.array(squares), odds) for squares, odds in three)
+        return [Astray(names=(), long_squares=s, short_squares=s, log_odds=odds) for s, odds in known]
+
+    first, second, third = each(1.0)
     assert first.behind(second) + second.behind(third) == pytest.approx(first.behind(third), abs=1e-9)
+    scaled = each(unit)
+    assert scaled[0].behind(scaled[1]) == pytest.approx(first.behind(second), rel=1e-9, abs=1e-9)
 
 
 def test_what_is_rare_needs_more_evidence_than_what_is_usual() -> None:
