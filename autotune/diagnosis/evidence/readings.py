@@ -205,8 +205,7 @@ def clipped_rows(recordings: Sequence[Recording], limits: Thresholds) -> tuple[l
     ):
         at = [r.y == level for r in recordings]
         runs = sum(len(runs_of(a)) for a in at)
-        often = count >= limits.least_clipped and count > OFTENER * np.max(beside, initial=0)
-        if often and (runs >= 2 or not elsewhere):
+        if count > OFTENER * np.max(beside, initial=0) and (runs >= 2 or not elsewhere):
             levels[key] = float(level)
             rows = [a | b for a, b in zip(rows, at, strict=True)]
     return rows, levels

@@ -94,7 +94,7 @@ def inspect(
     frozen = [f & ~c for f, c in zip(lost_rows(recordings, limits), clipped, strict=True)]
     count = sum(int(f.sum()) for f in frozen)
     total = sum(len(r) for r in recordings)
-    if count >= max(limits.least_frozen_rows, limits.least_frozen_share * total) and "sensor.dropout" not in without:
+    if count and "sensor.dropout" not in without:
         effects.append(_dropout(recordings, frozen, count / total))
         good = [g & ~f for g, f in zip(good, frozen, strict=True)]
     outliers = (
@@ -124,7 +124,7 @@ def outliers_in(
     pairs = list(zip(values, good, strict=True))
     lone = [spikes(v, g, limits.spike, least) for v, g in pairs]
     count, total = sum(int(s.sum()) for s in lone), sum(len(r) for r in recordings)
-    if count < limits.least_spikes:
+    if count < limits.least_run:
         return None
     heights = np.concatenate([np.abs(v - _neighbours(v, g))[s] for (v, g), s in zip(pairs, lone, strict=True)])
     unit = str(recordings[0].metadata.get("units", {}).get("y", ""))
@@ -175,7 +175,7 @@ def _quantisation(recordings: Sequence[Recording], step: float, unit: str, limit
     jitter = np.concatenate([np.diff(r.y) for r in recordings])
     share = float(np.mean(jitter == 0.0))
     noise = jitter_of(np.concatenate([r.y for r in recordings]))
-    if share < limits.least_equal_share or step**2 / 12.0 < limits.least_rounding * noise**2:
+    if step**2 / 12.0 < limits.material * noise**2:
         return []  # too fine to matter beside the noise
     rows = sum(len(r) for r in recordings)
     return [

@@ -60,3 +60,10 @@ def test_an_effect_of_equations_alone_is_refused_in_a_chain(tmp_path: Path) -> N
     )
     with pytest.raises(InputError, match="models of equations alone"):
         read_any(file)
+
+
+def test_effects_that_cannot_be_told_apart_say_so_of_one_another() -> None:
+    """One of which no other says so is free in every fit."""
+    for kind in ALL:
+        for other in (other for other in kind.same if KINDS[other].same):
+            assert {other, *KINDS[other].same} == {kind.name, *kind.same}

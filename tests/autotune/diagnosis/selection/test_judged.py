@@ -15,7 +15,7 @@ from autotune.diagnosis.selection.probability import probability_of
 from autotune.diagnosis.thresholds import IN_USE
 from tests.autotune.diagnosis.selection.on_stretches import Astray
 
-LAG, READING_LAG = "actuator.lag", "sensor.lag"
+LAG, READING_LAG, DEAD = "actuator.lag", "sensor.lag", "timing.dead_time"
 GRAVITY, DRY, CURVED, DROPPING = (
     "plant.sine_torque", "plant.coulomb_friction", "actuator.nonlinear_gain", "plant.stribeck_friction",
 )  # fmt: skip
@@ -82,6 +82,20 @@ def test_of_two_that_command_and_reading_cannot_tell_apart_one_is_taken() -> Non
     plain, before, behind = hypothesis_of((), 3.0), hypothesis_of((LAG,), 1.0), hypothesis_of((READING_LAG,), 1.01)
     both = hypothesis_of((LAG, READING_LAG), 1.0, math.log(0.05))
     assert of_likely([plain, before, behind, both], {LAG, READING_LAG}) is before
+
+
+def test_that_y_comes_later_is_likely_though_neither_lag_nor_dead_time_is() -> None:
+    """To first order in its length a lag is a dead time: where both predict about as well they count together."""
+    plain, lag, dead = hypothesis_of((), 1.0), hypothesis_of((LAG,), 0.8), hypothesis_of((DEAD,), 0.81)
+    bend = hypothesis_of((CURVED,), 0.95)
+    found = [plain, bend, lag, dead]
+    candidates = probabilities(found, lag, 0.03)
+    alone = {c.name: c.probability for c in candidates}
+    assert max(alone[LAG], alone[DEAD]) < 0.5 < probability_of(DEAD, candidates)
+    assert (
+        probability_of(LAG, candidates) == probability_of(DEAD, candidates) == pytest.approx(alone[LAG] + alone[DEAD])
+    )
+    assert of_likely(found, {LAG, DEAD}) is lag
 
 
 def test_what_predicts_best_is_built_on_though_it_is_too_rare_to_lead() -> None:
