@@ -15,6 +15,7 @@ from autotune.diagnosis.equations.gathering_equations import evidence_of_equatio
 from autotune.diagnosis.findings import consistent, found_effects, places_of, said_by, sentences_of
 from autotune.diagnosis.gathering import evidence_of
 from autotune.diagnosis.result import Diagnosis, FoundEffect
+from autotune.diagnosis.selection.probability import share_of
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.diagnosis.verdict import Evidence, judged
 from autotune.effects import require_known
@@ -107,14 +108,15 @@ def _diagnosis(
     """Return what evidence says; where a sentence is said instead no physics is said to be missing."""
     verdict = "unexplained" if instead else judged(evidence)
     named = [e for e in found_effects(evidence, verdict) if e.name in kept]
-    effects = tuple(replace(e, probability=said[e.name]) for e in named)
+    own = {name: p * share_of(name, evidence.candidates) for name, p in said.items()}
+    effects = tuple(replace(e, probability=own[e.name]) for e in named)
     description = evidence.description() if verdict == "unexplained" and not instead else None
     places = () if instead else places_of(evidence, effects, description)
     handed_out, wanted = evidence.handed_out("none" if instead else verdict)
     withheld = ""
     if handed_out is not wanted and verdict != "unexplained":
         withheld = WITHHELD[handed_out is evidence.model]
-    first, *rest = (instead,) if instead else sentences_of(verdict, effects, evidence, places, said)
+    first, *rest = (instead,) if instead else sentences_of(verdict, effects, evidence, places, own)
     unsaid = evidence.unsaid if verdict in ("effect", "unexplained") and not instead else ""
     return Diagnosis(
         verdict=verdict,

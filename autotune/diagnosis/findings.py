@@ -124,7 +124,7 @@ def beside(effects: Sequence[FoundEffect], evidence: Evidence) -> str:
 
 def left_open(effects: Sequence[FoundEffect], evidence: Evidence, said: Mapping[str, float]) -> tuple[str, ...]:
     """Return what is said of effects that are not named and that the recordings do not rule out."""
-    named = {like for e in effects for like in (*counted_as(e.name), *kind_of(e.name).includes)}
+    named = {n for e in effects for n in (*counted_as(e.name) - {*kind_of(e.name).like}, *kind_of(e.name).includes)}
     able = {n: p for n, p in said.items() if n not in named and p >= 1.0 - evidence.limits.decided}
     likeliest = sorted(able, key=lambda name: -able[name])[: evidence.limits.most_open]
     told = ", ".join(f"{name} ({able[name]:.2f})" for name in likeliest)

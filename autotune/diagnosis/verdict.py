@@ -216,12 +216,12 @@ class Evidence(ABC):
         return tuple((i, float(r.t[0] + after), float(r.t[-1])) for i, r in pairs)
 
     def places(self, name: str) -> tuple[str, ...]:
-        """Return where an effect may sit, and where one does that is the same as it and that these rows leave open."""
+        """Return where an effect may sit, and where one like it does that these rows leave open."""
         kind, odds = kind_of(name), (1.0 - self.limits.decided) / self.limits.decided
         own = max((c.probability for c in self.candidates if name in c.name.split("+")), default=1.0)
         open_ = {n for c in self.candidates if c.probability > odds * own for n in c.name.split("+")}
         places = dict.fromkeys(kind.may_sit)
-        for other in kind.same:
+        for other in (*kind.same, *kind.like):
             places |= dict.fromkeys(kind_of(other).may_sit) if other in open_ else {}
         return tuple(places)
 

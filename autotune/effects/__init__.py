@@ -52,14 +52,14 @@ def kind_of(name: str, where: str = "catalogue") -> EffectKind:
 
 
 def counted_as(name: str) -> frozenset[str]:
-    """Return the effects whose finding is one of an effect: itself, one like it, and larger ones that include it."""
+    """Return the effects whose finding is one of an effect: itself, those like it, and larger ones that include it."""
     larger = (kind.name for kind in KINDS.values() if name in kind.includes)
-    return frozenset((name, *KINDS[name].same, *larger))
+    return frozenset((name, *KINDS[name].same, *KINDS[name].like, *larger))
 
 
 def called(name: str) -> str:
     """Return the one name of all effects that command and reading cannot tell from one another."""
-    return min((name, *KINDS[name].same))
+    return min((name, *KINDS[name].same, *KINDS[name].like))
 
 
 def taken_by(names: Iterable[str]) -> set[str]:

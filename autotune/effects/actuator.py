@@ -372,7 +372,8 @@ ACTUATOR = (
         parameters=(Quantity(name="time_constant", unit="s", role="amplitude"),),
         linear=LinearPart(blocks=_with_lag, states=1, at="front", start=_last_commands),
         starts=lambda s: [(c * s.lag_s,) for c in (0.05, 0.25)],
-        same=("sensor.lag", "timing.dead_time"),
+        same=("sensor.lag",),
+        like=("timing.dead_time",),
         places=("actuator", "sensor", "plant"),
         odds=lacking(usual="any", possible="damper"),
         in_equations=InEquations(

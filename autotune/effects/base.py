@@ -360,9 +360,11 @@ class EffectKind:
     excludes : tuple of str
         Effects that are not looked for where this one is seen in the samples.
     same : tuple of str
-        Effects that cannot be told apart from it with command and measurement alone, or only in fast records; itself
-        not counted. Drifts of load and sensor are the same on a chain that settles; on others one of them simply
-        explains nothing. A lag and a dead time differ to second order in their length: which it is fits tell, or not.
+        Effects that cannot be told apart from it with command and measurement alone; itself not counted. Drifts of
+        load and sensor are the same on a chain that settles; on others one of them simply explains nothing.
+    like : tuple of str
+        Effects that differ from it to second order in their size, as a lag and a dead time do in their length: one of
+        them may be likely where none is alone.
     recoordinates : bool
         Whether it is a change of the plant's coordinates: where no command moves, nothing tells it from the plant.
     includes : tuple of str
@@ -408,6 +410,7 @@ class EffectKind:
     late_stamps: bool = False
     excludes: tuple[str, ...] = ()
     same: tuple[str, ...] = ()
+    like: tuple[str, ...] = ()
     recoordinates: bool = False
     includes: tuple[str, ...] = ()
     places: tuple[str, ...] = ()

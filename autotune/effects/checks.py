@@ -152,7 +152,7 @@ def _line(kind: EffectKind, line: Line) -> Iterator[tuple[str, str]]:
 def _related(kind: EffectKind, names: Sequence[str]) -> Iterator[tuple[str, str]]:
     if names.count(kind.name) > 1:
         yield "stands twice in the catalogue", "give one of them another name"
-    for key in ("same", "excludes", "includes"):
+    for key in ("same", "like", "excludes", "includes"):
         for other in getattr(kind, key):
             if other not in names:
                 yield f"{key} names {other!r}, which does not exist", "use a name of the catalogue"

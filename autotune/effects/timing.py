@@ -33,7 +33,7 @@ TIMING = (
         parameters=(Quantity(name="delay", unit="s", role="amplitude"),),
         linear=LinearPart(blocks=_with_delay),
         starts=lambda s: [(c,) for c in (0.5 * s.dt_s, 2.5 * s.dt_s, 6.0 * s.dt_s, 14.0 * s.dt_s, 0.3 * s.lag_s)],
-        same=("actuator.lag", "sensor.lag"),
+        like=("actuator.lag", "sensor.lag"),
         places=("timing", "actuator", "sensor"),
         odds=lacking(usual="any", possible="damper"),
         in_equations=InEquations(

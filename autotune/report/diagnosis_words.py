@@ -250,7 +250,7 @@ def _bins(laws: Sequence[MissingLaw]) -> list[str]:
 def _of_effect(effect: FoundEffect) -> list[str]:
     kind, said = kind_of(effect.name), []
     if kind.same:
-        said.append(f"Command and reading alone can hardly tell {effect.name} from {joined(list(kind.same))}.")
+        said.append(f"Command and reading alone cannot tell {effect.name} from {joined(list(kind.same))}.")
     unfelt = [key.replace("_", " ") for key, p in effect.parameters.items() if not math.isfinite(p.sd)]
     if unfelt and kind.is_simulated:
         said.append(f"The recordings do not say how exact {joined(unfelt)} of {in_short(effect.name)} is.")

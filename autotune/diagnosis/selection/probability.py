@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.effects import counted_as
+from autotune.effects import KINDS, counted_as
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,3 +43,13 @@ def probability_of(name: str, candidates: Sequence[Candidate], most: float = Thr
     group = counted_as(name)
     total = sum(c.probability for c in candidates if group & set(c.name.split("+")))
     return min(max(total, 0.0), most)
+
+
+def share_of(name: str, candidates: Sequence[Candidate]) -> float:
+    """Return the share that an effect has in its probability beside those like it, as a lag has beside a dead time."""
+    group = counted_as(name)
+    own, total = (
+        sum(c.probability for c in candidates if some & set(c.name.split("+")))
+        for some in (group - set(KINDS[name].like), group)
+    )
+    return own / total if total > 0.0 else 1.0

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import autotune
-from autotune.effects import ALL, KINDS
+from autotune.effects import ALL, KINDS, counted_as
 from autotune.effects.in_equations import MOVING
 from autotune.equations.expressions import names_in, parse
 from autotune.errors import InputError
@@ -65,5 +65,6 @@ def test_an_effect_of_equations_alone_is_refused_in_a_chain(tmp_path: Path) -> N
 def test_effects_that_cannot_be_told_apart_say_so_of_one_another() -> None:
     """One of which no other says so is free in every fit."""
     for kind in ALL:
-        for other in (other for other in kind.same if KINDS[other].same):
-            assert {other, *KINDS[other].same} == {kind.name, *kind.same}
+        for other in (KINDS[other] for other in kind.same if KINDS[other].same):
+            assert {other.name, *other.same} == {kind.name, *kind.same}
+        assert all(counted_as(other) == counted_as(kind.name) for other in kind.like)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from autotune.diagnosis.evidence.stretches import STRETCHES
 from autotune.diagnosis.selection.judged import built_on, of_likely, probabilities, rank
-from autotune.diagnosis.selection.probability import probability_of
+from autotune.diagnosis.selection.probability import probability_of, share_of
 from autotune.diagnosis.thresholds import IN_USE
 from tests.autotune.diagnosis.selection.on_stretches import Astray
 
@@ -96,6 +96,9 @@ def test_that_y_comes_later_is_likely_though_neither_lag_nor_dead_time_is() -> N
         probability_of(LAG, candidates) == probability_of(DEAD, candidates) == pytest.approx(alone[LAG] + alone[DEAD])
     )
     assert of_likely(found, {LAG, DEAD}) is lag
+    assert share_of(LAG, candidates) + share_of(DEAD, candidates) == pytest.approx(1.0)
+    assert share_of(LAG, candidates) * probability_of(LAG, candidates) == pytest.approx(alone[LAG])
+    assert share_of(CURVED, candidates) == 1.0
 
 
 def test_what_predicts_best_is_built_on_though_it_is_too_rare_to_lead() -> None:
