@@ -116,8 +116,8 @@ class ReadingMonitor:
             return "the sensor answers not a number"
         if reading.suspect:
             return "the link answers unreliably"
-        # near the last one or the median: the median is late where y turns within few samples, and one wild reading that
-        # was let through does not make the next good one wild
+        # near the last one or the median: the median is late where y turns within few samples, and one wild reading
+        # that was let through does not make the next good one wild
         jump = self.jump * (1.0 + sum(self._lost) / RECENT) + 2.0 * self.noise
         if self.recent and min(abs(reading.y - near) for near in (self.recent[-1], median(self.recent))) > jump:
             return f"the sensor jumps from {median(self.recent):.4g} to {reading.y:.4g}"

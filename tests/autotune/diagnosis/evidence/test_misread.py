@@ -40,7 +40,7 @@ def test_a_reversed_sign_is_said_first_and_is_no_physics() -> None:
     found = diagnose(OVEN, [oven(101, gain=-2.0)])
     assert "the sign of u, or of the model's gain, is reversed" in first_words(found)
     assert next_experiment(found) is None  # a better recording of the wrong sign tells no more
-    assert dict(answers(found, None))["What was found"] == found.sentences[0]
+    assert dict(answers(found))["What was found"] == found.sentences[0]
 
 
 def test_exchanged_columns_are_said_first() -> None:
