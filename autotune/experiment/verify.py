@@ -23,7 +23,7 @@ from autotune.experiment.loop import ControlLoop
 from autotune.experiment.own_law import law_of, try_own_law
 from autotune.experiment.result import State, Status
 from autotune.experiment.return_to_setpoint import is_near, setpoint_before
-from autotune.experiment.rig import Exchanges, Rig, RunsLaws, RunsOwnController, TrialGains
+from autotune.experiment.rig import Exchanges, HoldsGains, Rig, RunsLaws, RunsOwnController, TrialGains
 from autotune.experiment.run import (
     OnStatus,
     bring_to_operating_point,
@@ -183,7 +183,8 @@ def run_verification(
     test = plan_test(config, law, fit, crossover_rad_s, u_rest)
     if noise_sd is not None:
         _require_telling(expectation(test, law, fit, noise_sd, u_rest=config.operating_point.u_guess))
-    own, untried = _own_controller(rig, on_device or gains is not None)
+    simulated = config.rig.kind == "simulated"
+    own, untried = _own_controller(rig, simulated, on_device or gains is not None)
     extra = ("r", *further_columns(rig))
     writer = RecordingWriter(recording, ("t", "u", "y", *extra), recording_metadata(config))
     y_rest, trial = config.operating_point.y, None
@@ -214,15 +215,16 @@ def run_verification(
     if isinstance(rig, RunsLaws):
         law = replace(law, u_rate=math.inf)  # the device's own PI has no limit of the rate
         return judge(test, y, u, law, fit, noise_sd, u_rest=known.midpoint, by="device")
-    alone = config.rig.kind == "simulated" and not untried
-    by: Literal["host", "simulation"] = "simulation" if alone else "host"
+    by: Literal["host", "simulation"] = "simulation" if simulated and not untried else "host"
     return judge(test, y, u, law, fit, noise_sd, u_rest=known.midpoint, by=by, untried=untried)
 
 
-def _own_controller(rig: Rig, on_device: bool) -> tuple[RunsOwnController | None, str]:
-    """Return the rig where its own controller is to be tried, else why it is not."""
-    if not isinstance(rig, RunsOwnController) or isinstance(rig, RunsLaws):
+def _own_controller(rig: Rig, simulated: bool, on_device: bool) -> tuple[RunsOwnController | None, str]:
+    """Return the rig where its own controller is to be tried, else why it is not; a simulated rig has none to try."""
+    if not isinstance(rig, HoldsGains) or isinstance(rig, RunsLaws):
         return None, ""
+    if not isinstance(rig, RunsOwnController):
+        return None, "" if simulated else "the host has no means to start it"
     if rig.not_startable:
         return None, rig.not_startable
     return (rig, "") if on_device else (None, "the gains were not in it")

@@ -11,6 +11,7 @@ import pytest
 import tomli_w
 
 from autotune.config import load_config
+from autotune.config.rig import SerialSettings
 from autotune.controller import PIDController
 from autotune.errors import DesignError, ExperimentStopped
 from autotune.experiment.judgement import Verification, expectation, judge, require_predictable, smoothed
@@ -93,9 +94,10 @@ def verified(
     u_range: tuple[float, float] = (0.0, 10.0),
     delay_s: float = 0.1,
     rate: float = math.inf,
+    kind: SerialSettings | None = None,
     **steps: Any,
 ) -> Verification:
-    """Verify the gains on a rig of two lags, in virtual time."""
+    """Verify the gains on a rig of two lags, in virtual time; it may be taken for one of another kind."""
     (folder / "lags.toml").write_text(
         'name = "lags"\n[input]\nunit = "V"\n[output]\nunit = "V"\n[[block]]\nname = "lags"\nplace = "plant"\n'
         f"num = [1.0]\nden = [1.0, 2.5, 1.0]\ndelay = {delay_s}\n"
@@ -118,6 +120,7 @@ def verified(
     config = load_config(folder / "rig.toml")
     rig = open_rig(config.rig, u_range=u_range, u_safe=u_range[0])
     fit = fitted(LAGS, 0.9, 1.5, 3.0)
+    config = config if kind is None else config.model_copy(update={"rig": kind})
     return run_verification(rig, config, FAST, fit, folder / "verification.csv", u_rest=5.0)
 
 
@@ -143,6 +146,21 @@ def test_the_steps_keep_to_the_commands_room_where_a_dead_time_still_shows(tmp_p
     assert sound.accepted, sound.reason
     assert 4.0 < sound.u.min() < sound.u.max() < 6.0
     assert not verified(late, u_range=(4.0, 6.0), delay_s=0.3).accepted
+
+
+def test_a_device_that_holds_gains_and_cannot_be_started_is_not_called_verified(tmp_path: Path) -> None:
+    """A microcontroller whose host computes the PI has a law of its own; a simulated rig has none."""
+    on_line = SerialSettings.model_validate(
+        {"kind": "serial", "device": "/dev/none", "y_span": (0.0, 10.0), "u_span": (0.0, 10.0)}
+    )
+    real, played = tmp_path / "real", tmp_path / "played"
+    for folder in (real, played):
+        folder.mkdir()
+    found = verified(real, kind=on_line)
+    assert found.accepted
+    assert found.by == "host"
+    assert found.whose == "host's law verified; the device's own law not tried (the host has no means to start it)"
+    assert verified(played).whose == "host's law verified on a simulated rig"
 
 
 def test_a_command_at_its_limit_for_long_is_told(tmp_path: Path) -> None:
