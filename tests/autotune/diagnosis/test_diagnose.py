@@ -175,12 +175,7 @@ def test_the_rate_at_which_lift_falls_has_no_bias_and_an_honest_interval() -> No
 def test_the_lift_that_falls_with_height_is_in_what_explains_a_real_tube(shared: Path) -> None:
     """It is not named: of one part of the recording a lag explains as much."""
     folder = shared / "data" / "floatshield"
-    able = {
-        "plant.leak", "plant.position_dependent_gain", "plant.hard_stop", "actuator.lag", "sensor.lag",
-        "timing.dead_time",
-    }  # fmt: skip
-    recordings = [read_recording(folder / "fit_2.csv")]
-    found = diagnose(read_model(folder / "model_2.toml"), recordings, without=[n for n in CATALOGUE if n not in able])
+    found = diagnose(read_model(folder / "model_2.toml"), [read_recording(folder / "fit_2.csv")])
     assert "plant.leak" in {name for c in found.candidates for name in c.name.split("+")}
     assert "plant.leak" not in {e.name for e in found.effects}
     # on the half that no fit has seen; a linear model has 0.212 there
@@ -198,6 +193,7 @@ def test_a_ball_that_lies_on_the_floor_for_a_third_of_the_time_leaves_open_how_i
     assert "plant.leak" in {name for c in found.candidates for name in c.name.split("+")}
 
 
+@pytest.mark.timeout(900)  # three searches with blows, minutes on a busy machine
 def test_what_a_blow_makes_of_the_least_change_is_no_second_effect(shared: Path) -> None:
     """None of those that act as a force does, or hold y where it is: the others are left out for time."""
     case = shared / "practice_cases" / "case_005"
@@ -205,8 +201,8 @@ def test_what_a_blow_makes_of_the_least_change_is_no_second_effect(shared: Path)
         "plant.hard_stop", "plant.coulomb_friction", "plant.quadratic_drag", "plant.cubic_stiffness",
         "plant.hysteresis", "plant.resonance", "environment.step_load", "environment.gain_step", "sensor.saturation",
     }  # fmt: skip
-    recording = read_recording(case / "rec2.csv").only(np.arange(3000))  # with two thirds of all blows
-    found = diagnose(read_model(case / "model.toml"), [recording], without=[n for n in CATALOGUE if n not in able])
+    recordings = [read_recording(case / f"rec{k}.csv") for k in (1, 2)]
+    found = diagnose(read_model(case / "model.toml"), recordings, without=[n for n in CATALOGUE if n not in able])
     assert [e.name for e in found.effects] == ["plant.hard_stop"]
     assert found.effects[0].parameters["high"].value == pytest.approx(6.8958, abs=0.01)
 
