@@ -19,7 +19,7 @@ from autotune.errors import InputError
 from autotune.models import Parameter
 from autotune.report.chain_diagram import chain_diagram
 from autotune.report.diagnosis_words import answers, in_the_model, objections, places_of, verdict_of
-from autotune.report.effect_words import clause, in_short, number, of_candidate, sentence, with_spread
+from autotune.report.effect_words import clause, in_short, number, of_candidates, sentence, with_spread
 from autotune.report.law_figures import acting_figure, file_names, free_run_figure, law_figure
 from autotune.report.page import Figure, Page, Section, Table, Tone, write_page
 from autotune.report.screen_figures import curve_figure, over_time, screen_sections, trace_figures
@@ -270,13 +270,8 @@ def _times(effect: FoundEffect, known: _Evidence, most: int = 6) -> str:
 def _against(known: _Evidence) -> Section:
     """Say what speaks against the finding: rivals, what was not excited, what is left."""
     found = known.found
-    # an effect is named and no hypothesis of one leads: the samples or the operating point show it by themselves
-    beside = found.verdict == "effect" and bool(found.candidates) and found.candidates[0].name == "none"
-    rows = [
-        (of_candidate(c.name, beside=beside), f"{c.probability:.3f}")
-        for c in found.candidates
-        if c.probability >= _LEAST
-    ]
+    weighed = of_candidates([(c.name, c.probability) for c in found.candidates], found.verdict)
+    rows = [(words, f"{p:.3f}") for words, p in weighed if p >= _LEAST]
     odds = Table(
         header=("explanation", "probability"), rows=tuple(rows[:_RIVALS]),
         caption="All explanations that were weighed, the likeliest first, by all rows and the parts that leave some"

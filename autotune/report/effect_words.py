@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from autotune.effects import KINDS
 from autotune.models import Parameter
@@ -81,3 +82,17 @@ def of_candidate(name: str, *, beside: bool = False) -> str:
         none = "nothing else is missing" if beside else "nothing is missing"
         return {"none": none, "unknown": "a cause outside the catalogue"}[name]
     return joined([clause(one) for one in name.split("+")]) + f" ({name.replace('+', ' + ')})"
+
+
+def of_candidates(candidates: Sequence[tuple[str, float]], verdict: str) -> list[tuple[str, float]]:
+    """Return hypotheses in words, with their probabilities.
+
+    Parameters
+    ----------
+    candidates : sequence of (str, float)
+        Names and probabilities, the likeliest first.
+    verdict : str
+        Of the diagnosis that they are of: an effect that no hypothesis has leaves the likeliest of them without one.
+    """
+    beside = verdict == "effect" and bool(candidates) and candidates[0][0] == "none"
+    return [(of_candidate(name, beside=beside), p) for name, p in candidates]

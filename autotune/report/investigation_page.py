@@ -7,7 +7,7 @@ import os
 from autotune.diagnosis.result import Diagnosis
 from autotune.pipeline.investigation import Investigation
 from autotune.report.diagnosis_page import write_diagnosis_page
-from autotune.report.effect_words import of_candidate, unit_of
+from autotune.report.effect_words import of_candidates, unit_of
 from autotune.report.page import Section, Table
 
 
@@ -55,5 +55,4 @@ def list_candidates(candidates: tuple[tuple[str, float], ...], verdict: str) -> 
     verdict : str
         Of the diagnosis that they are of.
     """
-    beside = verdict == "effect" and bool(candidates) and candidates[0][0] == "none"
-    return ", ".join(f"{of_candidate(name, beside=beside)} {p:.2f}" for name, p in candidates[:3])
+    return ", ".join(f"{words} {p:.2f}" for words, p in of_candidates(candidates[:3], verdict))

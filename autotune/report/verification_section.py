@@ -10,6 +10,7 @@ from autotune.config.procedure import SignalSettings
 from autotune.experiment.judgement import Verification, smoothed
 from autotune.experiment.step_test import StepTest
 from autotune.report.chart import Chart, make_subplots
+from autotune.report.effect_words import sentence
 from autotune.report.figures import axis_title, ratio_title
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, RED, Figure, Section, Table, add_line, thinned
 
@@ -27,7 +28,7 @@ def verification_section(verification: Verification, signals: SignalSettings) ->
     measured, predicted, sd = verification.measured, verification.predicted, verification.predicted_sd
     unit = signals.y_unit
     rows = (
-        ("overshoot [%]", 100 * measured.overshoot, 100 * predicted.overshoot, 100 * sd.overshoot),
+        ("overshoot [%]", _percent(measured.overshoot), _percent(predicted.overshoot), _percent(sd.overshoot)),
         ("rise to 90 % [s]", measured.rise_s, predicted.rise_s, sd.rise_s),
         (f"peak under load [{unit}]", measured.peak, predicted.peak, sd.peak),
         (
@@ -48,7 +49,7 @@ def verification_section(verification: Verification, signals: SignalSettings) ->
             Table(
                 header=("", "measured", "predicted", "predicted scatter (sd)"),
                 rows=tuple(
-                    (name, *(f"{round(value, 12):.3g}" if math.isfinite(value) else "-" for value in values))
+                    (name, *(f"{value:.3g}" if math.isfinite(value) else "-" for value in values))
                     for name, *values in rows
                     if any(map(math.isfinite, values))
                 ),
@@ -67,9 +68,9 @@ def verification_section(verification: Verification, signals: SignalSettings) ->
     )
 
 
-def sentence(text: str) -> str:
-    """Return a text with a capital letter and a full stop."""
-    return f"{text[0].upper()}{text[1:]}."
+def _percent(share: float) -> float:
+    """Return a share in per cent; one of last bits is none."""
+    return round(100.0 * share, 9)
 
 
 def _test_text(test: StepTest, signals: SignalSettings) -> str:

@@ -8,13 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.arrays import FloatArray, IntArray
+from autotune.diagnosis.evidence.stretches import FAR_OFF
 from autotune.equations.fit_data import window_rows
 from autotune.equations.sensitivity import Windows, run_windows
 from autotune.equations.simulate import Compiled, Drive, simulate
 from autotune.equations.starts import LEAST, fitted_starts
 
-#: Spreads of y that an error counts at most: a simulation that runs away is that wrong.
-FAR_OFF = 10.0
 #: Share of the recording that is kept for judging, and of that the share that a start state is found from.
 HELD_OUT, SETTLED = 1.0 / 3.0, 0.15
 

@@ -81,12 +81,10 @@ def held_out_squares(result: Fit, data: Data) -> FloatArray:
     window's first rows say of its start state is always known. With thresholds that is first order: a stretch on which
     a threshold alone was felt is judged a little too well.
     """
-    labels, good = np.concatenate(stretches_of(data)), np.concatenate(data.good)
-    judged = np.array([np.sum(good & (labels == k)) for k in range(STRETCHES)])
-    most = judged * (FAR_OFF * spread_of(data)) ** 2
-    squares = most.copy()
+    squares, good = np.zeros(STRETCHES), np.concatenate(data.good)
     for k, out, there, _ in _left_out(result, data):
-        squares[k] = min(float(there.e[out] @ there.e[out]) * data.noise.sd**2, most[k])
+        most = float(np.sum(good & out)) * (FAR_OFF * spread_of(data)) ** 2
+        squares[k] = most if there is None else min(float(there.e[out] @ there.e[out]) * data.noise.sd**2, most)
     return squares
 
 
@@ -108,7 +106,7 @@ def error_beside_still(result: Fit, data: Data) -> float | None:
     for k, out, there, problem in _left_out(result, data):
         pairs = enumerate(zip(data.driving, labels, strict=True))
         driving = [r.standing_still(data.in_driving(i, label == k)) for i, (r, label) in pairs]
-        if all(one is r for one, r in zip(driving, data.driving, strict=True)):
+        if there is None or all(one is r for one, r in zip(driving, data.driving, strict=True)):
             continue
         beside = try_point(Problem(problem.parametrisation, data.driven_by(driving)), there.theta, there.x0)
         own += float(there.e[out] @ there.e[out])
@@ -116,8 +114,8 @@ def error_beside_still(result: Fit, data: Data) -> float | None:
     return math.sqrt(own / still) if still > 0.0 else None
 
 
-def _left_out(result: Fit, data: Data) -> Iterator[tuple[int, BoolArray, Iterate, Problem]]:
-    """Yield each stretch's number and rows, and where a fit to the others goes, unless it runs away."""
+def _left_out(result: Fit, data: Data) -> Iterator[tuple[int, BoolArray, Iterate | None, Problem]]:
+    """Yield each stretch's number and rows, and where a fit to the others goes; None where it runs away."""
     labels = np.concatenate(stretches_of(data))
     problem = Problem(result.parametrisation, data)
     problem.scales = result.sim.state_sizes(
@@ -127,9 +125,7 @@ def _left_out(result: Fit, data: Data) -> Iterator[tuple[int, BoolArray, Iterate
     J, Jx = result.jacobian[0], problem.jacobian(start, np.zeros(result.theta.size, dtype=bool))[1]
     for k in range(STRETCHES):
         out = labels == k
-        there = _without(problem, start, (J, Jx), out)
-        if there is not None:
-            yield k, out, there, problem
+        yield k, out, _without(problem, start, (J, Jx), out), problem
 
 
 def _without(

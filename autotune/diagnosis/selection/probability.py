@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 
 from autotune.diagnosis.thresholds import Thresholds
@@ -40,16 +40,16 @@ def weighed(scores: Mapping[str, float], scale: float, unknown_odds: float) -> t
 
 def probability_of(name: str, candidates: Sequence[Candidate], most: float = Thresholds.most_probable) -> float:
     """Return the probability that an effect is part of the truth: as such, in a larger one, or as one like it."""
-    group = counted_as(name)
-    total = sum(c.probability for c in candidates if group & set(c.name.split("+")))
-    return min(max(total, 0.0), most)
+    return min(_sum_of(counted_as(name), candidates), most)
 
 
 def share_of(name: str, candidates: Sequence[Candidate]) -> float:
     """Return the share that an effect has in its probability beside those like it, as a lag has beside a dead time."""
     group = counted_as(name)
-    own, total = (
-        sum(c.probability for c in candidates if some & set(c.name.split("+")))
-        for some in (group - set(KINDS[name].like), group)
-    )
-    return own / total if total > 0.0 else 1.0
+    total = _sum_of(group, candidates)
+    return _sum_of(group - set(KINDS[name].like), candidates) / total if total > 0.0 else 1.0
+
+
+def _sum_of(names: Set[str], candidates: Sequence[Candidate]) -> float:
+    """Return the probability of all hypotheses that have one of the effects."""
+    return sum((c.probability for c in candidates if names & set(c.name.split("+"))), 0.0)
