@@ -52,7 +52,7 @@ class GainRegisterRig(RegisterRig):
     def read_gains(self) -> PIDController:
         """Return the gains the device's controller holds now."""
         self._link.connect()
-        return self._decoded([list(self._link.read(block).words) for block in self._parts])
+        return self._decode_gains([list(self._link.read(block).words) for block in self._parts])
 
     def holdable(self, controller: PIDController) -> PIDController:
         """Return the controller that the device would hold after these gains were written: rounded to its registers.
@@ -64,7 +64,7 @@ class GainRegisterRig(RegisterRig):
         DesignError
             The device's form cannot express the controller.
         """
-        held = self._decoded(self._encoded(controller))
+        held = self._decode_gains(self._encode_gains(controller))
         if not self.takes_weight:  # a weight of the set-point leaves feedback and margins alone
             held = replace(held, setpoint_weight=controller.setpoint_weight)
         return held
@@ -99,13 +99,13 @@ class GainRegisterRig(RegisterRig):
         LinkError
             What is read back differs, or the link broke; says what the device holds, as far as it is known.
         """
-        new = self._encoded(controller)
+        new = self._encode_gains(controller)
         self._link.connect()
         old = [list(self._link.read(block).words) for block in self._parts]
         try:
             self._write_checked(new)
         except LinkError as error:
-            raise self._restored(old, error) from None
+            raise self._restore_gains(old, error) from None
 
     @property
     def not_startable(self) -> str:
@@ -222,7 +222,7 @@ class GainRegisterRig(RegisterRig):
         dict of str to PIDController
             By what is wrong, for one register after the other and for all of them; without those that change nothing.
         """
-        right = self._shown(self._encoded(controller))
+        right = self._shown(self._encode_gains(controller))
         found: dict[str, PIDController] = {}
         for order in ("word_order", "byte_order"):
             wrong = {name: self._otherwise(name, value, order) for name, value in right.items()}
@@ -275,14 +275,14 @@ class GainRegisterRig(RegisterRig):
         other = "big" if getattr(codec.register, order) == "little" else "little"
         return Codec(name=name, register=codec.register.model_copy(update={order: other})).decode(codec.encode(value))
 
-    def _encoded(self, controller: PIDController) -> list[list[int]]:
+    def _encode_gains(self, controller: PIDController) -> list[list[int]]:
         """Return the words of every block of gains."""
         values = {self._gain_names[name]: value for name, value in settings_of(self._gains, controller).items()}
         return [
             [word for codec, _ in block.parts for word in codec.encode(values[codec.name])] for block in self._parts
         ]
 
-    def _decoded(self, words: Sequence[list[int]]) -> PIDController:
+    def _decode_gains(self, words: Sequence[list[int]]) -> PIDController:
         return self._controller(self._shown(words))
 
     def _shown(self, words: Sequence[list[int]]) -> dict[str, float]:
@@ -313,7 +313,7 @@ class GainRegisterRig(RegisterRig):
             words = Codec(name="unlock", register=self._unlock).encode(float(code))
             self._link.write(self._unlock.table, self._unlock.address, words)
 
-    def _restored(self, old: Sequence[list[int]], cause: LinkError) -> LinkError:
+    def _restore_gains(self, old: Sequence[list[int]], cause: LinkError) -> LinkError:
         """Write the old gains again and return the error that says how it ended."""
         try:
             self._link.disconnect()

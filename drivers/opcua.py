@@ -113,7 +113,7 @@ class OpcUaLink:
                 self._lock.give_back()
             if isinstance(error, (KeyboardInterrupt, InputError, LinkError, *_DEFECTS)):
                 raise
-            raise self._named(error) from None
+            raise self._link_error(error) from None
 
     def disconnect(self) -> None:
         """Disconnect; may be called more than once, and does not raise."""
@@ -141,7 +141,7 @@ class OpcUaLink:
                 continue
             value = values[nodes.index(name)]
             if value.StatusCode is not None and value.StatusCode.is_bad():
-                raise self._refused(name, value.StatusCode.name)
+                raise self._refusal(name, value.StatusCode.name)
             words += _words(self._raw[name], value.Value.Value if value.Value is not None else None)
         return Answer(words, attempts > 1, took_s)
 
@@ -172,7 +172,7 @@ class OpcUaLink:
         codes, attempts, _ = self._exchange(lambda: self._write(names, values))
         for name, code in zip(names, codes, strict=True):
             if code.is_bad():
-                raise self._refused(name, code.name)
+                raise self._refusal(name, code.name)
         return attempts > 1
 
     def read_numbers(self, place: str) -> list[float]:
@@ -185,9 +185,9 @@ class OpcUaLink:
         """
         value, _, _ = self._exchange(lambda: self._read_array(place))
         if value.StatusCode is not None and value.StatusCode.is_bad():
-            raise self._refused_at("the array", place, value.StatusCode.name)
+            raise self._refusal_at("the array", place, value.StatusCode.name)
         if value.Value is None or value.Value.VariantType is not ua.VariantType.Double:
-            raise self._refused_at("the array", place, "BadTypeMismatch")
+            raise self._refusal_at("the array", place, "BadTypeMismatch")
         held = value.Value.Value
         return [float(number) for number in (held if isinstance(held, list) else [held])]
 
@@ -213,7 +213,7 @@ class OpcUaLink:
         """
         (code,), _, _ = self._exchange(lambda: self._write_array(place, list(numbers)))
         if code.is_bad():
-            raise self._refused_at("the array", place, code.name)
+            raise self._refusal_at("the array", place, code.name)
 
     async def _read_array(self, place: str) -> ua.DataValue:
         assert self._client is not None
@@ -251,7 +251,7 @@ class OpcUaLink:
                 held = (await node.read_data_value()).Value
                 access = await node.get_user_access_level()
             except UaStatusCodeError as error:
-                raise self._refused(name, type(error).__name__) from None
+                raise self._refusal(name, type(error).__name__) from None
             wanted = settings.nodes.type_of(name)
             variant = held.VariantType if held is not None else ua.VariantType.Null
             if variant is not _VARIANTS[wanted]:
@@ -263,7 +263,7 @@ class OpcUaLink:
                     "map a node that holds a number",
                 )  # fmt: skip
             if name not in SAMPLE and ua.AccessLevel.CurrentWrite not in access:
-                raise self._refused(name, "BadNotWritable")
+                raise self._refusal(name, "BadNotWritable")
             self._nodes[name] = node
 
     async def _node(self, client: Client, given: str) -> Node:
@@ -295,7 +295,7 @@ class OpcUaLink:
             except _DEFECTS:
                 raise
             except Exception as error:  # whatever the library raises where the line is gone
-                failure = self._named(error)
+                failure = self._link_error(error)
             self._hang_up()
         assert failure is not None
         raise failure
@@ -356,14 +356,14 @@ class OpcUaLink:
         self._began_s = at_s if math.isnan(self._began_s) else self._began_s
         return at_s - self._began_s
 
-    def _refused(self, name: str, code: str) -> LinkError:
-        return self._refused_at(f"the node of {name}", getattr(self._settings.nodes, name).node, code)
+    def _refusal(self, name: str, code: str) -> LinkError:
+        return self._refusal_at(f"the node of {name}", getattr(self._settings.nodes, name).node, code)
 
-    def _refused_at(self, which: str, place: str, code: str) -> LinkError:
+    def _refusal_at(self, which: str, place: str, code: str) -> LinkError:
         what, remedy = refusal(code)
         return LinkError(f"{which} {what}", where=f"{self.where}, {place}", remedy=remedy)
 
-    def _named(self, error: BaseException) -> LinkError:
+    def _link_error(self, error: BaseException) -> LinkError:
         what, remedy = sentence_on(error)
         return LinkError(what, where=self.where, remedy=remedy)
 

@@ -219,12 +219,12 @@ class S7Link:
         try:
             line.connect(settings.timeout_s)
         except S7TimeoutError:
-            raise self._failed(NO_ANSWER) from None
+            raise self._failure(NO_ANSWER) from None
         except S7Error as error:
             # the library says only by its words which of TCP and the protocol above it was refused
             if str(error).startswith("TCP"):
-                raise self._failed(NO_CONNECTION, error.__context__) from None
-            raise self._failed(REFUSED) from None
+                raise self._failure(NO_CONNECTION, error.__context__) from None
+            raise self._failure(REFUSED) from None
         self._connection, self._protocol = line, S7Protocol()
         self._ask(self._protocol.build_setup_communication_request(pdu_length=_PDU))
 
@@ -236,7 +236,7 @@ class S7Link:
         data = self._ask(request, parts)["data"] or {}
         self._require_done(data.get("return_code", 0), parts)
         if len(data["data"]) != count:
-            raise self._failed(LOST)
+            raise self._failure(LOST)
         held = bytes(data["data"])
         return {part.name: held[part.place.byte - start :][: part.size] for part in parts}
 
@@ -250,7 +250,7 @@ class S7Link:
 
     def _require_done(self, code: int, parts: Sequence[Part]) -> None:
         if code != _DONE:
-            raise self._refused(item_refusal(code), parts)
+            raise self._refusal(item_refusal(code), parts)
 
     def _ask(self, request: bytes, parts: Sequence[Part] = ()) -> dict[str, Any]:
         """Send a request and return its answer; whatever the library raises on the way is a LinkError."""
@@ -260,13 +260,13 @@ class S7Link:
             answer = self._protocol.parse_response(self._connection.receive_data())
             self._protocol.validate_pdu_reference(answer["sequence"])
         except S7TimeoutError:
-            raise self._failed(NO_ANSWER) from None
+            raise self._failure(NO_ANSWER) from None
         except S7Error as error:
             if error.error_code:
-                raise self._refused(request_refusal(error.error_code), parts) from None
-            raise self._failed(LOST, error.__context__) from None
+                raise self._refusal(request_refusal(error.error_code), parts) from None
+            raise self._failure(LOST, error.__context__) from None
         except (OSError, struct.error) as error:
-            raise self._failed(LOST, error) from None
+            raise self._failure(LOST, error) from None
         return answer
 
     def _exchange(self, ask: Callable[[], _T]) -> tuple[_T, int]:
@@ -289,11 +289,11 @@ class S7Link:
         if line is not None:
             line.disconnect()
 
-    def _failed(self, said: tuple[str, str], cause: BaseException | None = None) -> LinkError:
+    def _failure(self, said: tuple[str, str], cause: BaseException | None = None) -> LinkError:
         words = getattr(cause, "strerror", None) or (str(cause) if cause is not None else "")
         return LinkError(said[0] + (f" ({words})" if words else ""), where=self.where, remedy=said[1])
 
-    def _refused(self, said: tuple[str, str], parts: Sequence[Part]) -> LinkError:
+    def _refusal(self, said: tuple[str, str], parts: Sequence[Part]) -> LinkError:
         """Return the refusal of a request, with the first of its places."""
         if not parts:
             return S7Refused(f"a request {said[0]}", where=self.where, remedy=said[1])

@@ -52,7 +52,7 @@ class SessionLock:
         digest = hashlib.sha256(self._address.encode()).hexdigest()[:16]
         self._path = folder / f"autotune-rig-{digest}.lock"
         while self._file is None:
-            file = self._locked()
+            file = self._open_locked()
             # whoever had it before has removed it meanwhile: this lock is on a file that nobody else finds
             if _is_at(file, self._path):
                 self._file = file
@@ -60,7 +60,7 @@ class SessionLock:
                 os.close(file)
         return True
 
-    def _locked(self) -> int:
+    def _open_locked(self) -> int:
         """Return a locked file, open."""
         try:
             file = os.open(self._path, os.O_RDONLY | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o600)

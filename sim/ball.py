@@ -141,7 +141,7 @@ class Ball:
         dt_s : float
             How long [s].
         """
-        self._u_applied = self._converted(u)
+        self._u_applied = self._convert(u)
         _advance(self._x, self._u_applied - self.settings.hover, dt_s, self.settings.ends)
         self._time_s += dt_s
 
@@ -150,13 +150,13 @@ class Ball:
         if not self._noise:
             half = self.settings.noise
             self._noise = self._random.uniform(-half, half, 4096).tolist()
-        return self._converted(float(self._x[3]) + self._noise.pop())
+        return self._convert(float(self._x[3]) + self._noise.pop())
 
     def response(self, omega_rad_s: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Truth: H(j omega) of (23)."""
         return np.asarray(GAIN / np.polyval(DENOMINATOR, 1j * np.asarray(omega_rad_s)), dtype=np.complex128)
 
-    def _converted(self, volts: float) -> float:
+    def _convert(self, volts: float) -> float:
         bits = self.settings.bits
         if bits is None:
             return volts

@@ -93,7 +93,7 @@ class S7Rig(ServedRig):
             trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             trial.bind((self._address, self._port))
         self._start_s = time.perf_counter()
-        self.cpu.set_events_callback(self._taken)
+        self.cpu.set_events_callback(self._take_client_write)
         self.cpu.start_to(self._address, self._port)
         try:
             self._ready.set()
@@ -125,7 +125,7 @@ class S7Rig(ServedRig):
             form = _FORMS[place.type]
             struct.pack_into(form, memory, place.byte, count if form[1] in "fd" else round(count))
 
-    def _taken(self, event: SrvEvent) -> None:
+    def _take_client_write(self, event: SrvEvent) -> None:
         """Have the program take what a client has written, all of it in one cycle."""
         if event.EvtCode != _WRITTEN or self.cpu.cpu_state is not CPUState.RUN:
             return

@@ -131,11 +131,11 @@ class SerialRig:
                 *pieces, received = received.split(b"\0")
                 for piece in pieces:
                     self._now_s = self.now_s
-                    answer = self._answered(_unstuffed(piece))
+                    answer = self._answer(_unstuff(piece))
                     if answer:
-                        os.write(self._line, _stuffed(answer + struct.pack("<H", _crc(answer))) + b"\0")
+                        os.write(self._line, _stuff(answer + struct.pack("<H", _crc(answer))) + b"\0")
 
-    def _answered(self, content: bytes) -> bytes:
+    def _answer(self, content: bytes) -> bytes:
         """Return the answer to a request; nothing where the bytes are none."""
         if len(content) < 6 or struct.pack("<H", _crc(content[:-2])) != content[-2:] or content[0] != _VERSION:
             return b""
@@ -239,7 +239,7 @@ def _crc(data: bytes) -> int:
     return crc
 
 
-def _stuffed(content: bytes) -> bytes:
+def _stuff(content: bytes) -> bytes:
     """COBS, from the end backwards: each zero becomes the distance to the next one."""
     out = bytearray(b"\0" + content)
     distance = 1
@@ -250,7 +250,7 @@ def _stuffed(content: bytes) -> bytes:
     return bytes(out)  # short of 254 bytes, so that no distance is too long
 
 
-def _unstuffed(piece: bytes) -> bytes:
+def _unstuff(piece: bytes) -> bytes:
     """Return the content of a piece between two zero bytes; nothing where it is damaged."""
     out = bytearray(piece)
     at = 0

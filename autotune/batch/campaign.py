@@ -131,7 +131,7 @@ class Campaign:
         skip = set(done)
         loops = [loop for loop in self.loops if loop.name not in skip]
         shared = [name for name in dict.fromkeys(loop.file for loop in loops) if self._is_shared(name)]
-        prepared = {name: tuple(self._prepared(path, name, advance) for path in matches(Path(name))) for name in shared}
+        prepared = {name: tuple(self._convert(path, name, advance) for path in matches(Path(name))) for name in shared}
         return {
             loop.name: Work(loop=loop, settings=self.settings, prepared=prepared.get(loop.file, ())) for loop in loops
         }
@@ -156,7 +156,7 @@ class Campaign:
         loops = [loop for loop in self.loops if loop.file == file]
         return len(loops) > 1 and self.settings.export is not None and not file.endswith(".parquet")
 
-    def _prepared(self, path: Path, file: str, advance: Progress) -> Path:
+    def _convert(self, path: Path, file: str, advance: Progress) -> Path:
         """Return a CSV export as Parquet, of which a loop reads its own tags without the others."""
         export = self.settings.export
         assert export is not None

@@ -29,7 +29,7 @@ def from_chain(model: Model) -> EquationModel:
         A state per pole, gains and time constants as parameters. Effects of the chain are not taken along: they
         say where they act in words of a chain.
     """
-    return _assembled(model, _Chain(["u"]), [_command(model, "u")])
+    return _assemble(model, _Chain(["u"]), [_command(model, "u")])
 
 
 def chain_with_inputs(content: Mapping[str, Any], where: str) -> EquationModel:
@@ -61,7 +61,7 @@ def chain_with_inputs(content: Mapping[str, Any], where: str) -> EquationModel:
         one, path, acts = _disturbance(table, f"{where} [[input]] {number}")
         columns.append(one)
         (at_plant if acts == "plant" else at_output).append(made.block(one.column, path, Name(one.column)))
-    return replace(_assembled(chain, made, columns, at_plant, at_output), effects=chain.effects)
+    return replace(_assemble(chain, made, columns, at_plant, at_output), effects=chain.effects)
 
 
 def _command(chain: Model, column: str) -> InputColumn:
@@ -71,7 +71,7 @@ def _command(chain: Model, column: str) -> InputColumn:
     )  # fmt: skip
 
 
-def _assembled(
+def _assemble(
     chain: Model, made: _Chain, inputs: Sequence[InputColumn], at_plant: Sequence[Expression] = (),
     at_output: Sequence[Expression] = (),
 ) -> EquationModel:  # fmt: skip

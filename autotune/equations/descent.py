@@ -94,7 +94,7 @@ class Descent:
         rows = sum(int(np.sum(w.stops - w.starts)) for w in windows)
         runs = side_by_side(run_of, each) if len(each) > 1 and rows > WORTH_A_THREAD else map(run_of, each)
         for (one, w), run in zip(each, runs, strict=True):
-            error = (one.y - run.y)[one.good & _covered(one.y.size, w)]
+            error = (one.y - run.y)[one.good & _covered_rows(one.y.size, w)]
             if not np.all(np.isfinite(error)):
                 return None
             found.append(error)
@@ -108,7 +108,7 @@ class Descent:
         """Return per recording J to z with the start states projected out, and per window what gives those back."""
         per_z = slopes_of(self._compiled, self._z)
         known, self._known = self._known or self.sensitivities(), None
-        return [self._projected(one, s, per_z) for one, s in zip(self._data, known, strict=True)]
+        return [self._project_windows(one, s, per_z) for one, s in zip(self._data, known, strict=True)]
 
     def sensitivities(self) -> list[Sensitivities]:
         """Return the derivatives of every recording's readings at the iterate."""
@@ -131,7 +131,7 @@ class Descent:
         each = zip(self._data, drives or [one.drive for one in self._data], strict=True)
         return [run_windows(self._compiled, p, drive, one.windows).y for one, drive in each]
 
-    def _projected(self, one: FitData, s: Sensitivities, per_z: FloatArray) -> _Derivatives:
+    def _project_windows(self, one: FitData, s: Sensitivities, per_z: FloatArray) -> _Derivatives:
         J = (s.to_parameters * per_z)[:, self._which]
         X = s.to_states * self._scales
         parts, back = [], []
@@ -158,7 +158,7 @@ class Descent:
         gained = 0.0
         for k in range(most):
             damping = self._damping
-            if not self._attempted(derivatives, 12 if k == 0 else 1):
+            if not self._attempt_move(derivatives, 12 if k == 0 else 1):
                 self._damping = damping if k else self._damping
                 break
             cost, previous = self._cost(), cost
@@ -168,7 +168,7 @@ class Descent:
         self._sd = self._noise(self._errors)
         return bool(before - cost < _SMALL * before)
 
-    def _attempted(self, derivatives: Sequence[_Derivatives], tries: int) -> bool:
+    def _attempt_move(self, derivatives: Sequence[_Derivatives], tries: int) -> bool:
         """Take a move that lowers the penalised sum of squares, shorter ones where the first does not.
 
         Where a move ends too high, what its derivatives did not foresee is taken back by one more with the same ones:
@@ -205,7 +205,7 @@ class Descent:
         None where the simulation runs away.
         """
         z = at.z[self._which]
-        e = np.concatenate([_projected_error(back, error) for back, error in zip(backs, at.errors, strict=True)])
+        e = np.concatenate([_project_error(back, error) for back, error in zip(backs, at.errors, strict=True)])
         move = np.linalg.solve(damped, J.T @ (e / self._sd) - z - foreseen) if z.size else np.zeros(0)
         new_z = at.z.copy()
         new_z[self._which] += np.clip(move, -3.0, 3.0)
@@ -284,14 +284,14 @@ class Descent:
         )  # fmt: skip
 
 
-def _covered(rows: int, windows: Windows) -> BoolArray:
+def _covered_rows(rows: int, windows: Windows) -> BoolArray:
     covered = np.zeros(rows, dtype=bool)
     for a, b in zip(windows.starts, windows.stops, strict=True):
         covered[a:b] = True
     return covered
 
 
-def _projected_error(back: _Back, error: FloatArray) -> FloatArray:
+def _project_error(back: _Back, error: FloatArray) -> FloatArray:
     """Return the errors without what start states explain."""
     parts, at = [], 0
     for *_, Q in back:

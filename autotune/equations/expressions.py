@@ -164,15 +164,15 @@ class _Parser:
         return tree
 
     def _product(self) -> Expression:
-        tree = self._signed()
+        tree = self._read_signed()
         while (sign := self._take("*", "/")) is not None:
-            divisor_at, right = self._at, self._signed()
+            divisor_at, right = self._at, self._read_signed()
             if sign == "/" and right == Number(0.0):
                 raise self._refused("division by zero", self._tokens[divisor_at][2])
             tree = Call(sign, (tree, right))
         return tree
 
-    def _signed(self) -> Expression:
+    def _read_signed(self) -> Expression:
         minus, count = False, 0
         while (sign := self._take("+", "-")) is not None:
             minus, count = minus ^ (sign == "-"), count + 1
@@ -188,7 +188,7 @@ class _Parser:
         self._depth += 1
         if self._depth > DEEPEST:
             raise self._refused("nested too deep")
-        exponent = self._signed()
+        exponent = self._read_signed()
         self._depth -= 1
         return Call("^", (base, exponent))
 
@@ -202,7 +202,7 @@ class _Parser:
                 raise self._refused("no number holds this", at)
             return Number(float(text))
         if kind == "name":
-            return self._called(text, at) if self._take("(") is not None else self._named(text, at)
+            return self._read_call(text, at) if self._take("(") is not None else self._read_name(text, at)
         if text == "(":
             tree = self._sum()
             self._close()
@@ -210,12 +210,12 @@ class _Parser:
         self._at -= 1
         raise self._refused("powers are written with ^, not **" if text == "**" else f"{text!r} has nothing before it")
 
-    def _named(self, name: str, at: int) -> Expression:
+    def _read_name(self, name: str, at: int) -> Expression:
         if name in FUNCTIONS:
             raise self._refused(f"{name} is a function: {name}(...)", at)
         return Name(name)
 
-    def _called(self, name: str, at: int) -> Expression:
+    def _read_call(self, name: str, at: int) -> Expression:
         if name not in FUNCTIONS:
             near = get_close_matches(name, FUNCTIONS, 1)
             hint = f", did you mean {near[0]}?" if near else ""

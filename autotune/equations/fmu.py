@@ -187,17 +187,17 @@ class FmuSimulation:
         """Return y at the drive's rows."""
         try:
             if self._description.coSimulation is not None:
-                return self._stepped(parameters, drive)
-            return self._exchanged(parameters, drive)
+                return self._step_rows(parameters, drive)
+            return self._integrate(parameters, drive)
         except InputError:
             raise
         except Exception as error:  # an FMU fails with whatever its maker's code does
             raise InputError(f"the FMU fails: {error}", where=str(self._path), remedy="check its parameters") from None
 
-    def _stepped(self, parameters: Mapping[str, float], drive: Drive) -> FloatArray:
+    def _step_rows(self, parameters: Mapping[str, float], drive: Drive) -> FloatArray:
         """Run a co-simulation FMU: its own solver from row to row, inputs held."""
         is_3 = str(self._description.fmiVersion).startswith("3.")
-        slave = self._opened(is_3)
+        slave = self._open_slave(is_3)
         references = self._references
         if not is_3:
             slave.setupExperiment(startTime=0.0)
@@ -218,7 +218,7 @@ class FmuSimulation:
             y += get_values(output)
         return np.array(y, dtype=np.float64)
 
-    def _opened(self, is_3: bool) -> Any:
+    def _open_slave(self, is_3: bool) -> Any:
         """Return the FMU reset, instantiated on first use."""
         from fmpy.fmi2 import FMU2Slave
         from fmpy.fmi3 import FMU3Slave
@@ -231,12 +231,12 @@ class FmuSimulation:
                 modelIdentifier=self._description.coSimulation.modelIdentifier,
             )  # fmt: skip
             self._slave.instantiate()
-            weakref.finalize(self, _freed, self._slave)
+            weakref.finalize(self, _free, self._slave)
         else:
             self._slave.reset()
         return self._slave
 
-    def _exchanged(self, parameters: Mapping[str, float], drive: Drive) -> FloatArray:
+    def _integrate(self, parameters: Mapping[str, float], drive: Drive) -> FloatArray:
         """Run a model-exchange FMU with FMPy's solver; a held input is two rows at each change."""
         fmpy = _fmpy()
         t = drive.t - drive.t[0]
@@ -255,7 +255,7 @@ class FmuSimulation:
         return np.asarray(np.interp(t, result["time"], result[self._value]), dtype=np.float64)
 
 
-def _freed(slave: Any) -> None:
+def _free(slave: Any) -> None:
     try:
         slave.terminate()
         slave.freeInstance()

@@ -46,7 +46,7 @@ def forecast(model: EquationModel, recording: Recording, horizon_s: float | None
     """
     applied = apply(model)
     compiled = compile_model(model, applied.extensions)
-    compiled = _delayed(compiled, applied.delays)
+    compiled = _add_delays(compiled, applied.delays)
     drive, good = applied.before(drive_of(model, recording)), np.isfinite(recording.y)
     if good.sum() < 8:
         raise InputError("fewer than 8 finite readings", where=recording.name, remedy="record longer")
@@ -54,10 +54,10 @@ def forecast(model: EquationModel, recording: Recording, horizon_s: float | None
         return applied.after(_free_run(compiled, drive, recording))
     if not horizon_s >= 2.0 * recording.sample_time_s:
         raise InputError(f"horizon = {horizon_s:g} s", where="--horizon", remedy="give at least two sample times")
-    return applied.after(_windowed(compiled, drive, recording, horizon_s))
+    return applied.after(_forecast_windows(compiled, drive, recording, horizon_s))
 
 
-def _delayed(compiled: Compiled, delays: FloatArray) -> Compiled:
+def _add_delays(compiled: Compiled, delays: FloatArray) -> Compiled:
     """Return the model with dead times at its inputs."""
     inputs = tuple(replace(one, delay_s=float(d)) for one, d in zip(compiled.model.inputs, delays, strict=True))
     return replace(compiled, model=replace(compiled.model, inputs=inputs))
@@ -71,7 +71,7 @@ def _free_run(compiled: Compiled, drive: Drive, recording: Recording) -> FloatAr
     return require_complete(run, compiled, recording.name).y
 
 
-def _windowed(compiled: Compiled, drive: Drive, recording: Recording, horizon_s: float) -> FloatArray:
+def _forecast_windows(compiled: Compiled, drive: Drive, recording: Recording, horizon_s: float) -> FloatArray:
     """Forecast window by window; each past is a filter of its own that carries its state along."""
     t, y, good = recording.t, recording.y, np.isfinite(recording.y)
     count = int(np.floor((t[-1] - t[0]) / horizon_s + 1e-9)) + 1
@@ -89,7 +89,7 @@ def _windowed(compiled: Compiled, drive: Drive, recording: Recording, horizon_s:
         for past in PASTS if k else (0.0,):
             start = max(min(int(np.searchsorted(t, t[a] - past * horizon_s)), a - LEAST), 0) if k else 0
             until = a if k else b
-            guess = None if before is None else _carried(compiled, drive, before, start)
+            guess = None if before is None else _carry_state(compiled, drive, before, start)
             window = fitted_starts(
                 compiled, p, drive, y, good, np.array([start]), np.array([until]), guess=guess, share=1.0, iterations=5
             )
@@ -107,7 +107,7 @@ def _windowed(compiled: Compiled, drive: Drive, recording: Recording, horizon_s:
     return result
 
 
-def _carried(compiled: Compiled, drive: Drive, before: Windows, row: int) -> FloatArray | None:
+def _carry_state(compiled: Compiled, drive: Drive, before: Windows, row: int) -> FloatArray | None:
     """Return the state that an earlier window leads to at a row, where it starts before it."""
     a = int(before.starts[0])
     if a >= row:

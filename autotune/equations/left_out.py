@@ -38,7 +38,7 @@ def left_out_squares(fitted: Fitted, recordings: Sequence[Recording], labels: Se
     that a stretch on which alone a threshold was felt is judged a little too well.
     """
     squares = np.zeros(1 + max(int(label.max(initial=-1)) for label in labels))
-    for k, there in _left_out(fitted, recordings, labels, squares.size):
+    for k, there in _refit_without(fitted, recordings, labels, squares.size):
         squares[k] = _squares(there.simulated(), recordings, labels, k)
     return squares
 
@@ -58,7 +58,7 @@ def error_beside_still(fitted: Fitted, recordings: Sequence[Recording], labels: 
     """
     own = still = 0.0
     model, count = fitted.compiled.model, 1 + max(int(label.max(initial=-1)) for label in labels)
-    for k, there in _left_out(fitted, recordings, labels, count):
+    for k, there in _refit_without(fitted, recordings, labels, count):
         driving = [r.standing_still(label == k, model.columns) for r, label in zip(recordings, labels, strict=True)]
         if any(one is not r for one, r in zip(driving, recordings, strict=True)):
             own += _squares(there.simulated(), recordings, labels, k)
@@ -73,7 +73,7 @@ def _squares(runs: Sequence[FloatArray], recordings: Sequence[Recording], labels
     return float(e @ e) if np.all(np.isfinite(e)) else math.inf
 
 
-def _left_out(
+def _refit_without(
     fitted: Fitted, recordings: Sequence[Recording], labels: Sequence[IntArray], count: int
 ) -> Iterator[tuple[int, Descent]]:
     """Yield each stretch's number and a fit that has moved to what the other rows say."""

@@ -153,7 +153,7 @@ class _Assembly:
             case op.SQUARE:
                 return b.fmul(a, a)
             case op.SELECT:
-                return self._selected(a, self._register(second), self._register(third))
+                return self._select_side(a, self._register(second), self._register(third))
             case op.CHOOSE:
                 above = b.fcmp_ordered(">=", self._register(third), _number(0.0))
                 return b.select(above, a, self._register(second))
@@ -172,7 +172,7 @@ class _Assembly:
                 return self._call(_BY_NAME[op.ATAN2], a, self._register(second))
         return self._call(_BY_NAME[operation], a)
 
-    def _selected(self, above: Any, below: Any, mode: Any) -> Any:
+    def _select_side(self, above: Any, below: Any, mode: Any) -> Any:
         b, one = self._b, _number(1.0)
         mixed = b.fadd(b.fmul(b.fadd(one, mode), above), b.fmul(b.fsub(one, mode), below))
         is_below = b.fcmp_ordered("==", mode, _number(-1.0))

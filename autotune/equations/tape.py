@@ -192,9 +192,9 @@ class _Translation:
                 if place not in now:
                     raise InputError(f"no input {place!r}", where=extension.name, remedy="name an input of the model")
             before = now[next(iter(changed))] if len(changed) == 1 else None
-            self._slopes |= {one.name: _valued(one.derivative, before) for one in extension.states}
+            self._slopes |= {one.name: _insert_value(one.derivative, before) for one in extension.states}
             for place, tree in changed.items():
-                trees[f"{place}|{number}"] = _valued(tree, now[place])
+                trees[f"{place}|{number}"] = _insert_value(tree, now[place])
                 now[place] = Name(f"{place}|{number}")
             for port, tree in extension.port.items():
                 if port not in trees:
@@ -203,7 +203,7 @@ class _Translation:
         self._reading = now.pop("output")
         return trees | now
 
-    def _added(self) -> dict[str, Expression]:
+    def _extended_slopes(self) -> dict[str, Expression]:
         """Return the derivatives with what extensions add to them."""
         slopes = dict(self._slopes)
         for extension in self._extensions:
@@ -215,7 +215,7 @@ class _Translation:
 
     def program(self, signals: Sequence[str]) -> Program:
         """Return the tape of everything."""
-        slopes = [self._of(tree) for tree in self._added().values()]
+        slopes = [self._of(tree) for tree in self._extended_slopes().values()]
         needed = len(self._tape.code)
         self._locates = False  # what only outputs need is decided at once
         outputs = [self._of(self._reading), *(self._of(parse(text, "signal")) for text in signals)]
@@ -241,7 +241,7 @@ class _Translation:
             modes=np.array(tape.modes, dtype=np.int64),
             ties=np.array(tape.ties, dtype=np.int64),
             linear=np.array([one.hold == "linear" for one in self._model.inputs], dtype=np.int64),
-            speeds=_needed(dynamic, tape.switches),
+            speeds=_needed_operations(dynamic, tape.switches),
         )
 
     def _of(self, tree: Expression) -> int:
@@ -295,12 +295,12 @@ class _Translation:
         if function == "sign":
             return self._choice(a, 0, tape.constant(1.0), tape.constant(-1.0))
         if function in op.UNARY:
-            return self._folded(op.UNARY[function], a)
+            return self._fold(op.UNARY[function], a)
         if function == "^" and arguments[1] == Number(2.0):
-            return self._folded(op.SQUARE, a)
-        return self._folded(op.BINARY[function], a, self._of(arguments[1]))
+            return self._fold(op.SQUARE, a)
+        return self._fold(op.BINARY[function], a, self._of(arguments[1]))
 
-    def _folded(self, operation: int, a: int, b: int = 0) -> int:
+    def _fold(self, operation: int, a: int, b: int = 0) -> int:
         """Write an operation, leaving out what a constant 0 or 1 makes idle."""
         zero, one = self._tape.constants.get(0.0, -1), self._tape.constants.get(1.0, -1)
         if operation == op.ADD and zero in (a, b):
@@ -326,7 +326,7 @@ class _Translation:
         return tape.write(op.MUL, tape.constant(0.5), tape.write(op.ADD, register, mirrored))
 
 
-def _needed(code: Sequence[tuple[int, ...]], registers: Sequence[int]) -> IntArray:
+def _needed_operations(code: Sequence[tuple[int, ...]], registers: Sequence[int]) -> IntArray:
     """Return the operations that registers depend on, in their order."""
     wanted, found = set(registers), []
     for row in reversed(code):
@@ -336,6 +336,6 @@ def _needed(code: Sequence[tuple[int, ...]], registers: Sequence[int]) -> IntArr
     return np.array(found[::-1], dtype=np.int64).reshape(-1, 5)
 
 
-def _valued(tree: Expression, value: Expression | None) -> Expression:
+def _insert_value(tree: Expression, value: Expression | None) -> Expression:
     """Return an expression of an extension, ``value`` replaced by what would be there without it."""
     return substituted(tree, lambda name: value if name == "value" else None)

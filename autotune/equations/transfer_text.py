@@ -52,9 +52,9 @@ def parse_transfer_function(text: str) -> TransferFunction:
     TransferFunction(num=(-65.5,), den=(0.36, 1.0, 0.0), delay_s=0.1)
     """
     if not isinstance(text, str):
-        raise _refused(f"{text!r}"[:40], "a transfer function is written as text")
+        raise _refusal(f"{text!r}"[:40], "a transfer function is written as text")
     if len(text) > _LONGEST:
-        raise _refused(text[:40], f"{len(text)} characters")
+        raise _refusal(text[:40], f"{len(text)} characters")
     plain = text.strip().replace("−", "-").replace("·", "*").replace("**", "^")
     if plain.lower().startswith("zpk"):
         found = _zpk(plain)
@@ -63,38 +63,38 @@ def parse_transfer_function(text: str) -> TransferFunction:
     else:
         delays = [float(next((g for g in m.groups() if g), "1")) for m in _DELAY.finditer(plain)]
         num, den = _rational(_DELAY.sub(" ", plain), text)
-        found = _made(num, den, sum(delays), text)
+        found = _make_transfer_function(num, den, sum(delays), text)
     if not found.is_proper:
-        raise _refused(text, "the numerator has a higher degree than the denominator")
+        raise _refusal(text, "the numerator has a higher degree than the denominator")
     return found
 
 
-def _refused(text: str, what: str) -> InputError:
+def _refusal(text: str, what: str) -> InputError:
     return InputError(what, where=f"transfer function {text!r}", remedy=_HELP)
 
 
-def _made(num: FloatArray, den: FloatArray, delay: float, text: str) -> TransferFunction:
+def _make_transfer_function(num: FloatArray, den: FloatArray, delay: float, text: str) -> TransferFunction:
     try:
         return TransferFunction(num=tuple(map(float, num)), den=tuple(map(float, den)), delay_s=delay)
     except InputError as error:
-        raise _refused(text, error.what) from None
+        raise _refusal(text, error.what) from None
 
 
 def _zpk(text: str) -> TransferFunction:
     inner = re.fullmatch(r"(?i)zpk\s*\(\s*\[(.*?)\]\s*[;,]\s*\[(.*?)\]\s*[;,]\s*(.+?)\s*\)(?:\s*(.*))?", text)
     if not inner:
-        raise _refused(text, "zeros, poles and gain are not told apart")
+        raise _refusal(text, "zeros, poles and gain are not told apart")
     try:
         zeros, poles = ([complex(p.replace("i", "j").replace(" ", "")) for p in _parts(g)] for g in inner.groups()[:2])
         gain = float(inner[3])
     except ValueError:
-        raise _refused(text, "a zero, a pole or the gain is no number") from None
+        raise _refusal(text, "a zero, a pole or the gain is no number") from None
     num, den = gain * np.atleast_1d(np.poly(zeros)), np.atleast_1d(np.poly(poles))
     if np.any(np.abs(np.imag(num)) > 1e-9) or np.any(np.abs(np.imag(den)) > 1e-9):
-        raise _refused(text, "complex zeros and poles come in pairs")
+        raise _refusal(text, "complex zeros and poles come in pairs")
     late = _DELAY.search(inner[4] or "")
     delay = float(next((g for g in late.groups() if g), "1")) if late else 0.0
-    return _made(np.real(num), np.real(den), delay, text)
+    return _make_transfer_function(np.real(num), np.real(den), delay, text)
 
 
 def _parts(text: str) -> list[str]:
@@ -108,11 +108,11 @@ def _gain_and_lags(text: str) -> TransferFunction:
         lags = [float(part) for part in _parts(given.get("T", "").replace(" ", ","))]
         delay, integrators = float(given.get("L", "0")), int(given.get("I", "0"))
     except ValueError:
-        raise _refused(text, "K, T, L or I is no number") from None
+        raise _refusal(text, "K, T, L or I is no number") from None
     den: Any = np.array([1.0])
     for lag in lags:
         den = np.polymul(den, [lag, 1.0])
-    return _made(np.array([gain]), np.append(den, np.zeros(min(integrators, _HIGHEST))), delay, text)
+    return _make_transfer_function(np.array([gain]), np.append(den, np.zeros(min(integrators, _HIGHEST))), delay, text)
 
 
 def _with_products(plain: str, text: str) -> str:
@@ -121,13 +121,13 @@ def _with_products(plain: str, text: str) -> str:
     while plain[at:].strip():
         found = _TOKEN.match(plain, at)
         if not found:
-            raise _refused(text, f"{plain[at:].strip()[0]!r} has no meaning here")
+            raise _refusal(text, f"{plain[at:].strip()[0]!r} has no meaning here")
         token, at = found[0].strip(), found.end()
         if before[-1:].isdigit() and token[0] in ".0123456789":
-            raise _refused(text, f"no sign stands between the numbers {before} and {token}")
+            raise _refusal(text, f"no sign stands between the numbers {before} and {token}")
         if before not in ("", *"-+*/^(") and token not in "-+*/^)":
             if divides[-1]:
-                raise _refused(text, f"what stands behind the / before {token!r} is not clear: write brackets")
+                raise _refusal(text, f"what stands behind the / before {token!r} is not clear: write brackets")
             written += "*"
         if token in "-+*/" and before not in ("*", "/"):
             divides[-1] = token == "/"
@@ -142,12 +142,12 @@ def _with_products(plain: str, text: str) -> str:
 def _rational(plain: str, text: str) -> _Pair:
     """Return numerator and denominator of a rational function of s."""
     try:
-        return _folded(parse(_with_products(plain, text)))
+        return _fold(parse(_with_products(plain, text)))
     except InputError as error:
-        raise _refused(text, error.what) from None
+        raise _refusal(text, error.what) from None
 
 
-def _folded(tree: Expression) -> _Pair:
+def _fold(tree: Expression) -> _Pair:
     """Return the polynomials that an expression in s is the ratio of."""
     match tree:
         case Number(value):
@@ -155,18 +155,18 @@ def _folded(tree: Expression) -> _Pair:
         case Name():
             return np.array([1.0, 0.0]), np.ones(1)
         case Call("neg", (inner,)):
-            num, den = _folded(inner)
+            num, den = _fold(inner)
             return -num, den
         case Call("^", (base, Number(power))) if power == int(power) <= _HIGHEST:
             num, den = np.ones(1), np.ones(1)
-            above, below = _folded(base)
+            above, below = _fold(base)
             for _ in range(int(power)):
                 num, den = np.polymul(num, above), np.polymul(den, below)
             return num, den
         case Call("/", (left, Call("neg", (right,)))):
-            return _folded(Call("neg", (Call("/", (left, right)),)))
+            return _fold(Call("neg", (Call("/", (left, right)),)))
         case Call(sign, (left, right)) if sign != "^":
-            (a, b), (c, d) = _folded(left), _folded(right)
+            (a, b), (c, d) = _fold(left), _fold(right)
             if sign in "+-":
                 c = c if sign == "+" else -c
                 return np.polyadd(np.polymul(a, d), np.polymul(c, b)), np.polymul(b, d)

@@ -179,7 +179,7 @@ def run_verification(
     law = law_for(controller, config.limits, config.signals.sample_time_s)
     crossover_rad_s = require_predictable(fit, controller).crossover_rad_s
     if isinstance(rig, Exchanges) and not isinstance(rig, RunsLaws):
-        fit = _delayed(fit, config.signals.sample_time_s)  # its commands act one sample after what they come from
+        fit = _add_delay(fit, config.signals.sample_time_s)  # its commands act one sample after what they come from
     test = plan_test(config, law, fit, crossover_rad_s, u_rest)
     if noise_sd is not None:
         _require_telling(expectation(test, law, fit, noise_sd, u_rest=config.operating_point.u_guess))
@@ -245,7 +245,7 @@ def _require_telling(expected: Expectation) -> None:
         )
 
 
-def _delayed(fit: PlantFit, delay_s: float) -> PlantFit:
+def _add_delay(fit: PlantFit, delay_s: float) -> PlantFit:
     parameters = fit.parameters.copy()
     parameters[-1] += delay_s
     plant = replace(fit.plant, delay_s=fit.plant.delay_s + delay_s)

@@ -126,7 +126,7 @@ def _sample(structure: Structure, evidence: Evidence, fitted: FloatArray, rng: n
     return np.vstack(kept)
 
 
-def _built(structure: Structure, x: FloatArray, evidence: Evidence) -> TransferFunction:
+def _build_plant(structure: Structure, x: FloatArray, evidence: Evidence) -> TransferFunction:
     p, omega_0 = dict(zip(structure.names, x, strict=True)), evidence.omega_0
     num, den = np.array([evidence.sign * math.exp(p["b"])]), np.array([1.0])
     if structure.first == "integrator":
@@ -205,12 +205,12 @@ def _consistent(points: tuple[FrequencyPoint, ...], probability: float) -> Consi
             continue
         least = min(least, size)
         sample = _sample(structure, evidence, fitted, rng)
-        plants += [_built(structure, x, evidence) for x in sample[rng.permutation(len(sample))[:_KEPT]]]
+        plants += [_build_plant(structure, x, evidence) for x in sample[rng.permutation(len(sample))[:_KEPT]]]
         structures.append(structure)
         sizes = np.sum(evidence.residuals(responses(structure, fitted, evidence.omega)) ** 2, axis=1)
         criterion = float(np.min(sizes)) + size * math.log(2 * len(points))
         if nominal is None or criterion < nominal[0]:
-            nominal = (criterion, _built(structure, fitted[int(np.argmin(sizes))], evidence))
+            nominal = (criterion, _build_plant(structure, fitted[int(np.argmin(sizes))], evidence))
     return ConsistentStructures(
         plants=tuple(plants),
         nominal=None if nominal is None else nominal[1],

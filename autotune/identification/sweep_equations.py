@@ -115,13 +115,13 @@ def fit_from_points(points: Sequence[FrequencyPoint], data: DelayData, largest: 
             continue
         through = sorted((*_through(omega, G, structure, h), h) for h in largest * _SHARES)
         places = [(a, h) for _, a, h in through[:_TRIED]]
-        places += [place for one in found for place in _grown(one, structure, omega)]
+        places += [place for one in found for place in _grow_places(one, structure, omega)]
         begun = min((solve_linear(data, structure, *place) for place in places), key=lambda point: point.cost)
-        found += _fitted(data, structure, begun, len(places), largest, np.empty(0))
+        found += _fit_structure(data, structure, begun, len(places), largest, np.empty(0))
     return _determined(found, data)
 
 
-def _grown(one: Fitted, structure: Structure, omega: FloatArray) -> list[tuple[tuple[float, ...], float]]:
+def _grow_places(one: Fitted, structure: Structure, omega: FloatArray) -> list[tuple[tuple[float, ...], float]]:
     """Return places (a, h) of a structure that a smaller one's minimum leads to; none where it is no step away."""
     more = structure.order - one.structure.order
     if one.structure.integrator != structure.integrator or structure.zeros - one.structure.zeros != (more == 0):
@@ -178,7 +178,7 @@ def fit_again(data: DelayData, found: Sequence[Fitted], largest: float, whitenin
     again: list[Fitted] = []
     for one in found:
         begun = solve_linear(data, one.structure, one.point.a, one.point.h, whitening)
-        again += _fitted(data, one.structure, begun, one.places, largest, whitening)
+        again += _fit_structure(data, one.structure, begun, one.places, largest, whitening)
     return _determined(again, data)
 
 
@@ -188,7 +188,7 @@ def _determined(found: list[Fitted], data: DelayData) -> list[Fitted]:
     return found
 
 
-def _fitted(
+def _fit_structure(
     data: DelayData, structure: Structure, begun: Point, places: int, largest: float, whitening: FloatArray
 ) -> list[Fitted]:
     """Return a structure at its minimum; nothing where the rows do not determine it."""

@@ -64,7 +64,7 @@ def analyse_sweep(
         return analysis
     try:
         tell("fitting the plant to the sweep's rows, for its points contradict the usual structures")
-        fit = fit_rows(_swept(experiment, folder))
+        fit = fit_rows(_read_cycles(experiment, folder))
         # the points are of the same rows, and what they say beyond the fit is the bias that made them contradict
         found = analyse((), settings, fit=fit, facts=facts)
     except AutotuneError as error:
@@ -141,7 +141,7 @@ def price_of(config: Config) -> Price | None:
     return price
 
 
-def _swept(experiment: ExperimentResult, folder: Path) -> tuple[Recording, ...]:
+def _read_cycles(experiment: ExperimentResult, folder: Path) -> tuple[Recording, ...]:
     """Return the rows of the limit cycles, sitting by sitting."""
     found = []
     for number, part in enumerate(experiment.parts):

@@ -194,13 +194,13 @@ def printed_tables(
     of_paper = {"RST": margins(plant, rebuilt.feedback()), "PI": margins(plant, PAPER_PI)}
     own = {name: margins(plant, feedback(law)) for name, law in laws.items()}
     return (
-        _printed_1(plant, reduced, found, of_paper["PI"].crossover_rad_s),
-        _printed_2(of_paper, rebuilt, {name: _row_2(laws[name], m) for name, m in own.items()}),
+        _table_1(plant, reduced, found, of_paper["PI"].crossover_rad_s),
+        _table_2(of_paper, rebuilt, {name: _row_2(laws[name], m) for name, m in own.items()}),
         _printed_text(plant, of_paper, own, omega),
     )
 
 
-def _printed_1(plant: TransferFunction, reduced: ReducedModel, found: Validation, crossover: float) -> Section:
+def _table_1(plant: TransferFunction, reduced: ReducedModel, found: Validation, crossover: float) -> Section:
     G_r, omega_d = PRINTED_1[:2]
     model = TransferFunction(num=(-G_r / omega_d, G_r), den=(1.0 / omega_d, 1.0, 0.0))
     plain, scaled = (criterion(plant, model, PAPER_PI, scaling=k) for k in (1.0, found.scaling))
@@ -237,7 +237,7 @@ def _printed_1(plant: TransferFunction, reduced: ReducedModel, found: Validation
     )
 
 
-def _printed_2(of_paper: Mapping[str, Margins], rebuilt: RST, own: Mapping[str, tuple[float | None, ...]]) -> Section:
+def _table_2(of_paper: Mapping[str, Margins], rebuilt: RST, own: Mapping[str, tuple[float | None, ...]]) -> Section:
     columns: dict[str, tuple[float | None, ...]] = {}
     for name, law in (("RST", rebuilt), ("PI", PAPER_PI)):
         p = PRINTED_2[name]

@@ -56,7 +56,7 @@ def record(d: Draw, which: int, physics: Physics, sized: tuple[Sized, ...]) -> R
         for k in np.flatnonzero(loses < s.lost):
             lost[k : k + int(s.lost_rows)] = 1.0
         spike = spike + np.where(spikes < s.spikes, np.sign(signs - 0.5) * s.spike_size, 0.0)
-        law = _changed(law, s)
+        law = _change_law(law, s)
     lost[0] = 0.0
     sampling = Sampling(rig.Ts, t, noise * rig.noise_sd, lost, spike)
     u, y, _clean, acts = run_loop(physics, law, sampling, ex.r, ex.dither, rig.substeps, np.zeros(N_STATES))
@@ -76,7 +76,7 @@ def record(d: Draw, which: int, physics: Physics, sized: tuple[Sized, ...]) -> R
     )
 
 
-def _changed(law: Law, s: Sized) -> Law:
+def _change_law(law: Law, s: Sized) -> Law:
     changes = {name: getattr(law, name) * factor for name, factor in s.law.items()}
     return law._replace(**changes) if law.kind != OPEN_LOOP else law
 

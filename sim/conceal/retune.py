@@ -167,7 +167,7 @@ def _degrees_lost(chain: Chain, window: int) -> float:
     return float(np.sqrt(window / (window - n)))
 
 
-def _moved(nominal: Chain, d: Floats) -> Chain:
+def _move_numbers(nominal: Chain, d: Floats) -> Chain:
     """Nominal chain with its numbers moved: logarithms of factors, one offset last but for the delay."""
     K, ta, tp = nominal.K * np.exp(d[0]), nominal.tau_actuator * np.exp(d[1]), nominal.tau_plant * np.exp(d[2])
     if nominal.integrating:  # its output offset is the integrator's state
@@ -201,7 +201,7 @@ def retune(
     bound[3] = 10.0 * float(np.std(records[0][0 if nominal.integrating else 1]))
 
     def residual(d: Floats) -> Floats:
-        return np.concatenate([residuals(_moved(nominal, d), u, y, Ts, window) for u, y in records])
+        return np.concatenate([residuals(_move_numbers(nominal, d), u, y, Ts, window) for u, y in records])
 
     at, damping = np.zeros(5), 1e-3
     e = residual(at)
@@ -230,7 +230,7 @@ def retune(
             damping *= 8.0
         if gain < tolerance:
             break
-    chain = _moved(nominal, at)
+    chain = _move_numbers(nominal, at)
     return chain, float(np.sqrt(np.mean(e**2)) * _degrees_lost(nominal, window))
 
 

@@ -106,13 +106,13 @@ def conceal(campaign: RecordedCampaign) -> Iterator[int]:
 def mark_all(campaign: RecordedCampaign) -> list[RecordedMark]:
     """Reveal the answers and mark every case by what is new in it."""
     plain = campaign.as_recorded
-    before = [_said(plain, i) for i in plain.seeds]
+    before = [_read_answer(plain, i) for i in plain.seeds]
     reached = [_error(plain, i, _answer(plain, i)) for i in plain.seeds]
     out = []
     for seed in campaign.cases.seeds:
         i = seed % len(campaign.rigs)
         spread = _answer(plain, i)["spread"]
-        out.append(_marked(campaign.cases, seed, before[i], reached[i] * (spread or math.nan)))
+        out.append(_mark_case(campaign.cases, seed, before[i], reached[i] * (spread or math.nan)))
     return out
 
 
@@ -120,7 +120,7 @@ def _answer(campaign: Campaign, seed: int) -> Json:
     return dict(json.loads(campaign.answer(seed).read_text(encoding="utf-8")))
 
 
-def _said(campaign: Campaign, seed: int) -> Json:
+def _read_answer(campaign: Campaign, seed: int) -> Json:
     path = campaign.diagnosis(seed) / "diagnosis.json"
     return dict(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else NOTHING
 
@@ -130,9 +130,9 @@ def _error(campaign: Campaign, seed: int, answer: Json) -> float:
     return forecast_nrmse(campaign.case(seed) / "unseen.csv", simulated, answer) if simulated.exists() else math.inf
 
 
-def _marked(campaign: Campaign, seed: int, before: Json, reached: float) -> RecordedMark:
+def _mark_case(campaign: Campaign, seed: int, before: Json, reached: float) -> RecordedMark:
     """Mark a case; ``reached`` is what the tool's model of the recording as it is errs by, in units of y."""
-    answer, said = _answer(campaign, seed), _said(campaign, seed)
+    answer, said = _answer(campaign, seed), _read_answer(campaign, seed)
     own = {name for effect in answer["effects"] for name in effect["accept"]}
     names = tuple(str(effect["name"]) for effect in before["effects"])
     if answer["sub"] == OFFSET_PUT_IN:  # to say so is right, and no effect
@@ -188,7 +188,7 @@ def as_json(campaign: RecordedCampaign, marks: Sequence[RecordedMark]) -> Json:
     return {
         "marks": [{**asdict(m.mark), "before": m.before, "not_counted": m.not_counted} for m in marks],
         "as_recorded": [
-            {"rig": one.rig.name, "closed_loop": one.rig.closed_loop, **_outline(_said(plain, i))}
+            {"rig": one.rig.name, "closed_loop": one.rig.closed_loop, **_outline(_read_answer(plain, i))}
             for i, one in enumerate(campaign.rigs)
         ],
         "rigs_refused": campaign.refused,

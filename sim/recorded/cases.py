@@ -190,10 +190,10 @@ def make(seed: int, rigs: Sequence[Ready]) -> Made:
         for strength in (str(one) for one in rng.permutation(list(STRENGTHS))):
             try:
                 put = _search_size(ready, effect, strength, seed)
-                return _made(ready, effect, strength, put, seed, passed_over)
+                return _make_case(ready, effect, strength, put, seed, passed_over)
             except RefusedError as why:
                 passed_over.append(f"{effect.name}, {strength}: {why}")
-    return _made(ready, None, None, _numbers_only(ready, place, rng), seed, passed_over)
+    return _make_case(ready, None, None, _numbers_only(ready, place, rng), seed, passed_over)
 
 
 def _in_turn(place: int, rng: np.random.Generator) -> list[Effect]:
@@ -204,7 +204,7 @@ def _in_turn(place: int, rng: np.random.Generator) -> list[Effect]:
     return [EFFECTS[place], *others]
 
 
-def _made(
+def _make_case(
     ready: Ready, effect: Effect | None, strength: str | None, put: Put, seed: int, passed_over: list[str]
 ) -> Made:
     found, numbers = ratio(ready, put, seed)

@@ -69,13 +69,13 @@ def table(marks: Sequence[RecordedMark]) -> list[Row]:
         _share("place, where something new is named", 0.95, [(m.rig, m.place_right) for m in singles if m.named]),
         _share("a wrong new name, beside the right one or alone", None, [(m.rig, not all(m.right)) for m in singles]),
         _share("numbers changed only: something new said", 0.02, [(m.rig, not m.verdict_right) for m in clean], True),
-        *_stated(counted),
+        *_probability_rows(counted),
         *_forecasts(counted),
         _share("left out: already named of the recording as it is", None, left_out),
     ]  # fmt: skip
 
 
-def _stated(marks: Sequence[Mark]) -> list[Row]:
+def _probability_rows(marks: Sequence[Mark]) -> list[Row]:
     said = [(m.rig, p, ok) for m in marks for p, ok in zip(m.probabilities, m.right, strict=True)]
     error = calibration_error([(p, ok) for _, p, ok in said])
     sure = [(rig, not ok) for rig, p, ok in said if p >= 0.95]

@@ -228,12 +228,12 @@ def _polish_on_all_rows(
         _require_determined(data, model, largest)
         found = profile(usable, structure, best, model, max_delay_s=limit)
         if found.endless:
-            raise _undetermined(data, found.model, largest, f"nothing bounds {found.endless}")
+            raise _refusal_of_order(data, found.model, largest, f"nothing bounds {found.endless}")
         if found.lower is None:
             _require_determined(data, found.model, largest)
             return widened(found.model, structure, colour)
         best = found.lower
-    raise _undetermined(data, model, largest, "several sets of parameters explain it alike")
+    raise _refusal_of_order(data, model, largest, "several sets of parameters explain it alike")
 
 
 def _require_inside(data: DelayData, model: DelayModel, largest: float) -> None:
@@ -250,7 +250,7 @@ def _require_determined(data: DelayData, model: DelayModel, largest: float) -> N
     n = model.order
     if sd[n] > _UNDETERMINED[n] * abs(model.b):
         why = f"the standard deviation of b is {100 * sd[n] / abs(model.b):.0f} % of it"
-        raise _undetermined(data, model, largest, why)
+        raise _refusal_of_order(data, model, largest, why)
 
 
 def _require_order(data: DelayData, structure: Structure, best: Point, model: DelayModel, largest: float) -> None:
@@ -276,7 +276,7 @@ def _require_order(data: DelayData, structure: Structure, best: Point, model: De
             )
 
 
-def _undetermined(data: DelayData, model: DelayModel, largest: float, why: str) -> IdentificationError:
+def _refusal_of_order(data: DelayData, model: DelayModel, largest: float, why: str) -> IdentificationError:
     period = input_period(data)
     n = model.order
     excites = "" if np.isnan(period) else f"; u repeats every {period:.3g} s and excites few frequencies"

@@ -208,7 +208,7 @@ def _search_bins(coarse: DelayData, structure: Structure, max_delay_s: float) ->
             continue
         found = [
             solve_linear(coarse.usable_from(h), structure, a, h)
-            for h, a in _modulated(grid, structure, length, coarse, max_delay_s)
+            for h, a in _estimate_by_instruments(grid, structure, length, coarse, max_delay_s)
         ]
         candidates += _local_minima(found)
     candidates = sorted((c for c in candidates if np.isfinite(c.cost)), key=lambda c: c.variance)
@@ -244,7 +244,7 @@ def _uniform(data: DelayData) -> _Bins:
     return _Bins(dt=dt, u=data.u[held], y=y)
 
 
-def _modulated(
+def _estimate_by_instruments(
     grid: _Bins, structure: Structure, length: int, data: DelayData, max_delay_s: float
 ) -> list[tuple[float, tuple[float, ...]]]:
     """Return (h, a) by instrumental variables for every delay of a grid an eighth of a window apart."""

@@ -159,10 +159,10 @@ def weighted_delay(
         The equations do not determine a, b and h.
     """
     with threadpool_limits(1):  # threads spin longer on these small matrices than they work
-        return _weighted(data, order, length_s, start_s)
+        return _fit_weighted(data, order, length_s, start_s)
 
 
-def _weighted(data: DelayData, order: int, length_s: float, start_s: float | None) -> tuple[FloatArray, FloatArray]:
+def _fit_weighted(data: DelayData, order: int, length_s: float, start_s: float | None) -> tuple[FloatArray, FloatArray]:
     largest = max(0.5 * (data.duration_s - length_s), 0.0)
     grid = np.arange(0.0, largest + 1e-12, length_s / (_HARMONICS + 2) / _GRID)
     found: list[tuple[float, FloatArray]] = []
@@ -176,7 +176,7 @@ def _weighted(data: DelayData, order: int, length_s: float, start_s: float | Non
         if tried is not None:
             found.append((tried.variance, tried.values))
     if not found:
-        raise _undetermined(data, order)
+        raise _refusal_of_order(data, order)
     values = min(found, key=lambda pair: pair[0])[1]
     return _settle(data, order, length_s, values, largest)
 
@@ -205,14 +205,14 @@ def _settle(
             simulated, colour = _correct_quadrature(plain, usable, values, coloured=coloured)
             found = _minimum(simulated, values, largest)
             if found is None:
-                raise _undetermined(data, order)
+                raise _refusal_of_order(data, order)
             sd = np.sqrt(np.diag(found.covariance))
             moved, values = np.abs(found.values - values), found.values
             if np.all(moved <= np.maximum(_SETTLED * sd, _ROUNDING * np.abs(values))):
                 break
     assert found is not None
     if not np.all(np.isfinite(found.covariance)) or not sd[n] < abs(values[n]):
-        raise _undetermined(data, order)
+        raise _refusal_of_order(data, order)
     wider = np.ones(n + 3) if colour is None else colour.widening()[: n + 3]
     return values, found.covariance * np.outer(wider, wider)
 
@@ -251,7 +251,7 @@ def _windows(data: DelayData, length_s: float, reach_s: float) -> Windows:
     return Windows(np.linspace(first, max(last, first), count), length_s, _HARMONICS)
 
 
-def _undetermined(data: DelayData, order: int) -> IdentificationError:
+def _refusal_of_order(data: DelayData, order: int) -> IdentificationError:
     return IdentificationError(
         f"modulated equations do not determine order {order}",
         where=data.name,

@@ -205,7 +205,7 @@ class Windows:
         for omega, sums in zip(self._omega, running, strict=True):
             part = interpolated(t, sums, first + self.length_s) - interpolated(t, sums, first)
             parts.append(part * np.exp(-1j * omega * first))
-        return self._combined(parts, derivative)
+        return self._combine(parts, derivative)
 
     def on(self, t: FloatArray, shift_s: float, derivative: int) -> FloatArray:
         """Return the windows' derivative at every t + shift, (windows, times).
@@ -221,15 +221,15 @@ class Windows:
         """
         s = t + shift_s - self.starts[:, None]
         inside = (s > 0.0) & (s < self.length_s)
-        return self._combined([np.where(inside, np.exp(1j * omega * s), 0.0) for omega in self._omega], derivative)
+        return self._combine([np.where(inside, np.exp(1j * omega * s), 0.0) for omega in self._omega], derivative)
 
     @property
     def areas(self) -> FloatArray:
         """Return the windows' integrals, (windows,)."""
         none = np.zeros(self.starts.size, dtype=np.complex128)
-        return self._combined([none + self.length_s, *[none] * (self.harmonics + 2)], 0)
+        return self._combine([none + self.length_s, *[none] * (self.harmonics + 2)], 0)
 
-    def _combined(self, waves: list[ComplexArray], derivative: int) -> FloatArray:
+    def _combine(self, waves: list[ComplexArray], derivative: int) -> FloatArray:
         """Return the windows, harmonic by harmonic, from the exponentials of non-negative frequencies."""
         rows = []
         for q in range(self.harmonics + 1):
