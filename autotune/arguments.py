@@ -80,7 +80,7 @@ def settings_of(
     }
 
 
-def checked(function: Callable[P, T]) -> Callable[P, T]:
+def check_arguments(function: Callable[P, T]) -> Callable[P, T]:
     """Return a function that refuses arguments which are not of the type that it says."""
     signature = inspect.signature(function)
 

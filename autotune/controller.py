@@ -19,8 +19,8 @@ from pydantic import Field, field_validator, model_validator
 from autotune.arrays import ComplexArray, FloatArray, is_real
 from autotune.errors import InputError
 from autotune.models import TransferFunction
-from autotune.schema import LONGEST_S, SHORTEST_S, Number, Section, Time, shortened, validated
-from autotune.text_files import checked_path, read_json, read_toml
+from autotune.schema import LONGEST_S, SHORTEST_S, Number, Section, Time, shorten, validate
+from autotune.text_files import check_path, read_json, read_toml
 from autotune.whole_files import write_whole
 
 
@@ -206,7 +206,7 @@ def read_controller(path: str | os.PathLike[str]) -> Controller:
     InputError
         No such file, neither TOML nor JSON, or keys that make no controller; names the key.
     """
-    where = str(checked_path(path))
+    where = str(check_path(path))
     if os.path.isdir(path):
         return read_controller(os.path.join(path, "result.json"))
     if os.path.splitext(path)[1].lower() == ".json":
@@ -217,9 +217,9 @@ def read_controller(path: str | os.PathLike[str]) -> Controller:
     if "num" in content or "den" in content:
         return _rational(content, where)
     if content.get("kind") not in ("pi", "pid"):
-        kind = shortened(repr(content.get("kind")))
+        kind = shorten(repr(content.get("kind")))
         raise InputError(f"kind = {kind}", where=where, remedy='write kind = "pi" or "pid", or num and den')
-    return _pid(validated(_PID, content, where))
+    return _pid(validate(_PID, content, where))
 
 
 def read_designed(path: str | os.PathLike[str]) -> PIDController:
@@ -255,10 +255,10 @@ def pid_from_table(table: Any, where: str) -> PIDController:
         raise InputError(
             "holds no K and Ti_s", where=where, remedy="give a design.json or the folder of a completed run"
         )
-    return _pid(validated(_DesignedPID, table, where))
+    return _pid(validate(_DesignedPID, table, where))
 
 
-def held_from_table(table: Any, where: str) -> PIDController:
+def read_noted_gains(table: Any, where: str) -> PIDController:
     """Return gains that were read from a rig and noted, to be written back as they were.
 
     A device as delivered may hold K = 0 or a negative time: they are what it held. What is not a number is refused.
@@ -275,7 +275,7 @@ def held_from_table(table: Any, where: str) -> PIDController:
     InputError
         A gain is missing or no finite number, or there is a key besides; names it.
     """
-    return _pid(validated(_HeldPID, table, where))
+    return _pid(validate(_HeldPID, table, where))
 
 
 def _pid(given: _HeldPID) -> PIDController:
@@ -289,7 +289,7 @@ def _pid(given: _HeldPID) -> PIDController:
 
 
 def _rational(content: dict[str, Any], where: str) -> Controller:
-    given = validated(_Rational, content, where)
+    given = validate(_Rational, content, where)
     if given.sample_time_s is None:
         return TransferFunction(num=given.num, den=given.den)
     return DiscreteController(

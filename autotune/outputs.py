@@ -133,7 +133,7 @@ class OutputFolder:
         _prove(out)
 
     @contextmanager
-    def filled(self) -> Iterator[Path]:
+    def write_all(self) -> Iterator[Path]:
         """Yield a folder in which to write the files; they are moved to their places when the block ends well."""
         with _beside(_folder(self.path)) as folder:
             yield folder

@@ -19,10 +19,10 @@ import numpy as np
 import tomli_w
 from scipy.optimize import minimize_scalar
 
-from autotune.arguments import checked
+from autotune.arguments import check_arguments
 from autotune.arrays import BoolArray, FloatArray, is_real
 from autotune.errors import InputError
-from autotune.text_files import checked_path, printable, read_toml
+from autotune.text_files import check_path, printable, read_toml
 from autotune.whole_files import append_whole, write_whole
 
 #: Largest size of a value that is computed with: far beyond every unit, far from where squares overflow.
@@ -177,7 +177,7 @@ class Recording:
         extra = {name: values[keep] for name, values in self.extra.items()}
         return replace(self, t=t, u=self.u[keep], y=self.y[keep], extra=MappingProxyType(extra))
 
-    @checked
+    @check_arguments
     def resampled(self, dt_s: float) -> Recording:
         """Return the recording on a uniform grid: commands held, other columns linearly interpolated.
 
@@ -229,7 +229,7 @@ class Recording:
         b = 1.0 if lateness(1.0) <= found.fun else float(found.x)  # even ones stay as they are
         return replace(self, t=earliest(b) + b * mean * number)
 
-    @checked
+    @check_arguments
     def standing_still(self, rows: BoolArray, columns: Sequence[str] = ("u",)) -> Recording:
         """Return the recording with commands that stand still, at their mean, through each run of some rows.
 
@@ -253,7 +253,7 @@ class Recording:
         u = still.pop("u", self.u)
         return replace(self, u=u, extra=MappingProxyType({**self.extra, **still})) if moving else self
 
-    @checked
+    @check_arguments
     def require_finite(self, columns: Iterable[str] = ("u", "y")) -> Recording:
         """Return self if the columns hold no NaN or infinity.
 
@@ -323,7 +323,7 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
         No such file, no ``t,u,y`` header, a cell that is not a number (names the line), or a sidecar that is none or
         states a sample time that the rows contradict.
     """
-    path = checked_path(path)
+    path = check_path(path)
     try:
         text = path.read_text(encoding="utf-8-sig", errors="replace")
     except OSError as error:

@@ -30,7 +30,7 @@ import numpy as np
 from autotune.config import Config
 from autotune.controller import PIDController
 from autotune.errors import AutotuneError, ExperimentStopped, OperatorStop
-from autotune.experiment.judgement import Verification, smoothed
+from autotune.experiment.judgement import Verification, smooth_steps
 from autotune.experiment.result import Status
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint, points_to_json
@@ -84,7 +84,7 @@ class RunLog:
         content = asdict(status) | {"points": points_to_json(status.points)}
         self._write("progress", **content)
 
-    def analysed(
+    def say_analysis(
         self,
         points: tuple[FrequencyPoint, ...],
         plant: TransferFunction,
@@ -112,12 +112,12 @@ class RunLog:
             controller=asdict(controller),
         )
 
-    def verified(self, verification: Verification) -> None:
+    def say_verification(self, verification: Verification) -> None:
         """Say how the new loop behaves on the rig beside what was predicted."""
         self._exit_status = 0 if verification.accepted else ExperimentStopped.exit_status
         test, prediction = verification.test, verification.prediction
         usable = np.isfinite(verification.y)
-        measured = smoothed(np.interp(test.t, test.t[usable], verification.y[usable]), test)
+        measured = smooth_steps(np.interp(test.t, test.t[usable], verification.y[usable]), test)
         thin = slice(None, None, max(1, test.t.size // PICTURE_ROWS))
         curves = {
             "t": test.t, "setpoint": test.setpoint, "measured": measured,

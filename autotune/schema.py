@@ -38,7 +38,7 @@ Time = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
 Text = Annotated[str, Field(max_length=200)]
 
 
-def validated(root: type[Root], content: Mapping[str, Any], where: str, *, texts: bool = False) -> Root:
+def validate(root: type[Root], content: Mapping[str, Any], where: str, *, texts: bool = False) -> Root:
     """Return the settings that a table of keys holds.
 
     Parameters
@@ -70,7 +70,7 @@ def _refusal(error: ValidationError, root: type[BaseModel], where: str) -> Input
     details = error.errors(include_url=False)
     first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
     at = _key_path(first, root)
-    path = shortened(".".join(str(part) for part in at))
+    path = shorten(".".join(str(part) for part in at))
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
     if first["type"] == "extra_forbidden":
         key = str(first["loc"][-1])
@@ -81,13 +81,13 @@ def _refusal(error: ValidationError, root: type[BaseModel], where: str) -> Input
     if first["type"] == "missing":
         return InputError(f"{path!r} is missing{more}", where=where, remedy=_describe(root, at))
     value = first.get("input")
-    shown = f" = {shortened(repr(value))}" if isinstance(value, str | int | float | bool) else ""
+    shown = f" = {shorten(repr(value))}" if isinstance(value, str | int | float | bool) else ""
     reason = first["msg"].removeprefix("Value error, ")
     key = f"{path}{shown}: " if path else ""  # what holds between keys of the whole file has no path
     return InputError(f"{key}{reason}{more}", where=where, remedy=_describe(root, at))
 
 
-def shortened(text: str) -> str:
+def shorten(text: str) -> str:
     """Return a text for a message: printable, and at most 80 characters of it."""
     text = printable(text)
     return text if len(text) <= 80 else f"{text[:77]}..."

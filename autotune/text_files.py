@@ -42,7 +42,7 @@ def read_text(path: str | os.PathLike[str]) -> str:
     InputError
         No such file, longer than 64 MiB, or in another encoding; names the first line that shows it.
     """
-    where = str(checked_path(path))
+    where = str(check_path(path))
     try:
         with open(path, "rb") as file:
             content = file.read(LONGEST_TEXT_BYTES + 1)
@@ -65,7 +65,7 @@ def read_text(path: str | os.PathLike[str]) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def checked_path(path: Any) -> Path:
+def check_path(path: Any) -> Path:
     """Return a path that a file can have.
 
     Raises
@@ -154,7 +154,7 @@ def is_control(character: str) -> bool:
     return unicodedata.category(character) in ("Cc", "Cf", "Cs") and character not in "\n\t\u00ad\u200b\u200c\u200d"
 
 
-def shown(text: str) -> str:
+def escape_controls(text: str) -> str:
     """Return a text with what commands a terminal, hides text or turns its direction written out; lines stay."""
     return "".join(c.encode("unicode_escape").decode() if is_control(c) else c for c in text)
 

@@ -124,14 +124,14 @@ class DeviceLawRig(SerialLineRig):
             if now_s - self._fed_s >= _FEED * self._settings.deadman_s:
                 self._link.send(Kind.READ)
                 self._fed_s = now_s
-            frame = self._link.arrived(min(_FEED * self._settings.deadman_s, patience_s))
+            frame = self._link.next_frame(min(_FEED * self._settings.deadman_s, patience_s))
             if frame is None or frame.kind not in (Kind.ROW, Kind.SAMPLE):
                 self._require(self._clock.now() - start_s < patience_s, "no row came", "check cable and power")
                 continue
             state = self._state(frame)
             if state & COMMAND != self._law:
                 self._law = Command.NOBODY
-                raise self._ended(state)
+                raise self._reason_of_end(state)
             if frame.kind == Kind.ROW:
                 return self._row(frame)
 
@@ -175,32 +175,34 @@ class DeviceLawRig(SerialLineRig):
         self._is_commanding = False
         received_s = self._fed_s = self._received_s = self._clock.now()
         self._latency_s = received_s - sent_s
-        reading = self._reading(frame, self._unwrapped(frame.values[0]), received_s, received_s - sent_s)
+        reading = self._reading(frame, self._unwrap_stamp(frame.values[0]), received_s, received_s - sent_s)
         if not runs:
             self._law, self._ticks_per_row, self._row_s = law, ticks, row_s
             self._count, self._area = 0, 0.0
             if repeated:  # the law may run since the request whose answer was lost
-                reading = self._begun()
+                reading = self._begin_law()
             self._row_at_s = reading.device_time_s
         return reading
 
-    def _begun(self) -> Reading:
+    def _begin_law(self) -> Reading:
         """Return when the law began, counted back from its first row; what y was then is not known."""
         patience_s = max(self._settings.timeout_s, 4 * self._row_s)
         until_s = self._clock.now() + patience_s
         first: Frame | None = None
         while first is None or first.kind != Kind.ROW:
             self._require(self._clock.now() < until_s, "no row came", "check cable and power")
-            first = self._link.arrived(patience_s)
+            first = self._link.next_frame(patience_s)
         self._link.put_back(first)
         ticks = first.sequence * self._ticks_per_row
-        reading = self._reading(first, self._unwrapped(first.values[0]) - ticks * self._tick_s, self._received_s, 0.0)
+        reading = self._reading(
+            first, self._unwrap_stamp(first.values[0]) - ticks * self._tick_s, self._received_s, 0.0
+        )
         return replace(reading, y=math.nan, latency_s=math.nan, suspect=True)
 
     def _row(self, frame: Frame) -> Row:
         count, area = frame.sequence, frame.values[5]
         ticks = (count - self._count) % 0x10000 * self._ticks_per_row
-        before_s, at_s = self._row_at_s, self._unwrapped(frame.values[0])
+        before_s, at_s = self._row_at_s, self._unwrap_stamp(frame.values[0])
         if ticks == 0 or abs(at_s - before_s - ticks * self._tick_s) > 0.5 * self._tick_s:
             raise LinkError(
                 f"the device's clock went {at_s - before_s:.4g} s over {ticks} ticks",
@@ -228,7 +230,7 @@ def open_kind(settings: SerialSettings, session: Session) -> SerialLineRig:
     return on_line(settings, u_range=session.u_range, u_safe=session.u_safe)
 
 
-def reached_by(settings: SerialSettings) -> Reach:
+def reach_of(settings: SerialSettings) -> Reach:
     """Return the serial device."""
     return Reach(device=settings.device)
 

@@ -155,12 +155,12 @@ class GainRegisterRig(RegisterRig):
         self._release(setpoint, on_trial=True)
         self._trial_setpoint = setpoint
         self._is_commanding, self._released_s = False, self._clock.now()
-        asked = {"automatic": 1.0, "trial": 1.0, "setpoint": self._held("setpoint", setpoint), "load": 0.0}
+        asked = {"automatic": 1.0, "trial": 1.0, "setpoint": self._round("setpoint", setpoint), "load": 0.0}
         # a device that refuses to say what it was asked for is not looked at
         self._asked = {
             name: value
             for name, value in asked.items()
-            if name in self._codecs and math.isfinite(self._shown_by_device(name))
+            if name in self._codecs and math.isfinite(self._read_back(name))
         }
         self._looks_s = self._clock.now()
         return asked["setpoint"]
@@ -206,8 +206,8 @@ class GainRegisterRig(RegisterRig):
         for name, value in asked.items():
             self._put(name, value)
             if name in self._asked:
-                self._asked[name] = self._held(name, value)
-        return self._held("setpoint", setpoint), self._held("load", load) if self.takes_load else 0.0
+                self._asked[name] = self._round(name, value)
+        return self._round("setpoint", setpoint), self._round("load", load) if self.takes_load else 0.0
 
     def misread(self, controller: PIDController) -> dict[str, PIDController]:
         """Return the controllers that a device holds which reads words or bytes of these gains in another order.
@@ -222,7 +222,7 @@ class GainRegisterRig(RegisterRig):
         dict of str to PIDController
             By what is wrong, for one register after the other and for all of them; without those that change nothing.
         """
-        right = self._shown(self._encode_gains(controller))
+        right = self._gains_of_words(self._encode_gains(controller))
         found: dict[str, PIDController] = {}
         for order in ("word_order", "byte_order"):
             wrong = {name: self._otherwise(name, value, order) for name, value in right.items()}
@@ -237,16 +237,16 @@ class GainRegisterRig(RegisterRig):
 
     def misread_setpoint(self, setpoint: float) -> dict[str, float]:
         """Return the set-points that a device has which reads words or bytes in another order [y unit]."""
-        right = self._held("setpoint", setpoint)
+        right = self._round("setpoint", setpoint)
         orders = ("word_order", "byte_order")
         wrong = {f"{order} of rig.registers.setpoint": self._otherwise("setpoint", right, order) for order in orders}
         return {name: value for name, value in wrong.items() if math.isfinite(value) and value != right}
 
-    def _looked_for_master(self, reading: Reading) -> Reading:
+    def _look_for_master(self, reading: Reading) -> Reading:
         """Look now and then whether the controller on trial is still asked for what the host wrote, too."""
         if self._is_released and self._may_look(reading, on_slow_line=self._takes_over):
             self._check_asked()
-        return super()._looked_for_master(reading)
+        return super()._look_for_master(reading)
 
     def _check_asked(self) -> None:
         """Refuse to go on with a trial in which somebody else asks the controller for something."""
@@ -265,7 +265,7 @@ class GainRegisterRig(RegisterRig):
                 "have nobody else write it while the controller is on trial",
             )
 
-    def _held(self, name: str, value: float) -> float:
+    def _round(self, name: str, value: float) -> float:
         """Return what a register holds of a value."""
         return self._codecs[name].decode(self._codecs[name].encode(value))
 
@@ -283,9 +283,9 @@ class GainRegisterRig(RegisterRig):
         ]
 
     def _decode_gains(self, words: Sequence[list[int]]) -> PIDController:
-        return self._controller(self._shown(words))
+        return self._controller(self._gains_of_words(words))
 
-    def _shown(self, words: Sequence[list[int]]) -> dict[str, float]:
+    def _gains_of_words(self, words: Sequence[list[int]]) -> dict[str, float]:
         """Return the engineering values of the words of every block of gains."""
         shown: dict[str, float] = {}
         for block, held in zip(self._parts, words, strict=True):

@@ -1,7 +1,7 @@
 """The kinds of rigs: one table, with a line for each ``kind`` of ``[rig]`` and the file that reaches it.
 
 A driver's file has ``open_kind(settings, session)``, which returns the rig, not yet opened. It may have
-``reached_by(settings)``, which says what has to be there before anything can be sent (absent: nothing, the rig is in
+``reach_of(settings)``, which says what has to be there before anything can be sent (absent: nothing, the rig is in
 this process), and ``probe_kind(settings, expected)``, which reads everything once and writes nothing.
 """
 
@@ -121,9 +121,9 @@ class Kind:
         rig: Rig = import_module(self.driver).open_kind(settings, session)
         return rig
 
-    def reached_by(self, settings: Section) -> Reach:
+    def reach_of(self, settings: Section) -> Reach:
         """Return what has to be there."""
-        say = getattr(import_module(self.driver), "reached_by", None)
+        say = getattr(import_module(self.driver), "reach_of", None)
         return say(settings) if say is not None else Reach()
 
     def probe(self, settings: Section, expected: Mapping[str, tuple[float, float]]) -> Any:
@@ -160,7 +160,7 @@ class Kind:
 
     def _require_files(self, settings: Section) -> None:
         """Refuse before anything is made for a session that cannot begin."""
-        for file in self.reached_by(settings).files:
+        for file in self.reach_of(settings).files:
             if not Path(file).is_file():
                 raise InputError(
                     "no such file",

@@ -26,7 +26,7 @@ def open_kind(settings: AnyModbusSettings, session: Session) -> Rig:
     return open_registers(ModbusLink(settings), settings, session, GainRegisterRig, permissives=settings.permissives)
 
 
-def reached_by(settings: AnyModbusSettings) -> Reach:
+def reach_of(settings: AnyModbusSettings) -> Reach:
     """Return address or serial device, and the certificates."""
     match settings:
         case ModbusTcpSettings():

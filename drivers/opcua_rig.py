@@ -47,7 +47,7 @@ def open_kind(settings: OpcUaSettings, session: Session) -> Rig:
     return open_registers(link, settings, session, OperatedRelayRig, arrays=link, relay=settings.relay)
 
 
-def reached_by(settings: OpcUaSettings) -> Reach:
+def reach_of(settings: OpcUaSettings) -> Reach:
     """Return the server's address, and the certificates."""
     parts = urlsplit(settings.endpoint)
     named = (settings.cert_file, settings.key_file, settings.server_cert_file, settings.password_file)

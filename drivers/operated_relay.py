@@ -202,7 +202,7 @@ class OperatedRelayRig(TypedGainRig):
             if self._rows:
                 break
             if (numbers[0], numbers[1]) != (self._law, _RELAY):
-                raise self._ended(numbers)
+                raise self._reason_of_end(numbers)
             self._require(
                 self._clock.now() - start_s < patience_s, "no row came", "look whether the device's program runs"
             )
@@ -279,7 +279,7 @@ class OperatedRelayRig(TypedGainRig):
             t_s = self._began_s + number * self._row_s
             self._rows.append(Row(reading=Reading(t_s=t_s, y=y, u_applied=u, latency_s=math.nan), u_mean=mean))
 
-    def _ended(self, numbers: Sequence[float]) -> ExperimentStopped | LinkError:
+    def _reason_of_end(self, numbers: Sequence[float]) -> ExperimentStopped | LinkError:
         """Return why the relay does not run any more."""
         (low, high), y = self._range, numbers[3]
         self._law = 0.0

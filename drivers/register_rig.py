@@ -168,7 +168,7 @@ class RegisterRig:
             reading, _ = self._sample()
         self._take(reading.u_applied, was_automatic=runs)
         # a device that holds another value than it was sent, or another's, has its command looked at no more
-        self._looks_s = self._clock.now() if self._shown_by_device("u") == self._command_held else math.inf
+        self._looks_s = self._clock.now() if self._read_back("u") == self._command_held else math.inf
 
     def read(self) -> Reading:
         """Take one sample; feeds the dead-man when that is due.
@@ -186,7 +186,7 @@ class RegisterRig:
         reading, values = self._sample()
         self._check_permissives(values)
         self._check_released(values)
-        reading = self._looked_for_master(reading)
+        reading = self._look_for_master(reading)
         if self._is_commanding and values.get("in_command") == 0.0:
             self._is_commanding = False
             raise LinkError(
@@ -356,7 +356,7 @@ class RegisterRig:
         """The command as its register holds it."""
         return self._codecs["u"].decode(self._codecs["u"].encode_within(self._u, *self._u_range))
 
-    def _shown_by_device(self, name: str) -> float:
+    def _read_back(self, name: str) -> float:
         """Return what a register holds now; NaN where a device refuses to say it."""
         try:
             return self._read((name,))[name]
@@ -373,7 +373,7 @@ class RegisterRig:
         now_s = self._clock.now()
         self._looks_s = now_s + (now_s - start_s) / _LOOK_SHARE
 
-    def _looked_for_master(self, reading: Reading) -> Reading:
+    def _look_for_master(self, reading: Reading) -> Reading:
         """Look now and then whether the command is still ours, and mark a sample before which it was not.
 
         Raises
@@ -384,7 +384,7 @@ class RegisterRig:
         if not self._is_commanding or not self._may_look(reading):
             return reading
         now_s = self._clock.now()
-        held, own = self._shown_by_device("u"), self._command_held
+        held, own = self._read_back("u"), self._command_held
         self._has_looked(now_s)
         if held == own or math.isnan(held):
             return reading

@@ -150,9 +150,9 @@ class Codec:
         if self._count is None or self._is_coded:
             if value not in (0.0, 1.0):
                 raise InputError(f"{value:g} does not fit a bit or a code", where=self.name, remedy="give 0 or 1")
-            return self._coded(self._codes[0 if value else 1], held)
+            return self._encode_code(self._codes[0 if value else 1], held)
         count = (value - self._offset) / self._scale
-        return self._packed(count if register.type in _FLOAT_MAX else round(count), value)
+        return self._pack_count(count if register.type in _FLOAT_MAX else round(count), value)
 
     def encode_within(self, value: float, low: float, high: float) -> tuple[int, ...]:
         """Return the words of the count that is nearest to the value and within limits.
@@ -188,20 +188,20 @@ class Codec:
             remedy="keep to the limits, or give the register a finer scale",
         )
 
-    def _coded(self, code: int, held: Sequence[int]) -> tuple[int, ...]:
+    def _encode_code(self, code: int, held: Sequence[int]) -> tuple[int, ...]:
         bit = self.register.bit
         if self._count is None:
             return (code,)
         if bit is None:
-            return self._packed(code, code)
+            return self._pack_count(code, code)
         if len(held) != self.register.words:
             raise InputError("a bit is written into its word", where=self.name, remedy="read the word first")
         data = struct.pack(f">{len(held)}H", *held)
         words = self._words.unpack(data)
         (count,) = self._count.unpack(_BIG[len(words)].pack(*(words[::-1] if self._is_reversed else words)))
-        return self._packed(count & ~(1 << bit) | code << bit, code)
+        return self._pack_count(count & ~(1 << bit) | code << bit, code)
 
-    def _packed(self, count: float, value: float) -> tuple[int, ...]:
+    def _pack_count(self, count: float, value: float) -> tuple[int, ...]:
         """Return the words of a count."""
         assert self._count is not None
         try:

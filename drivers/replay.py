@@ -150,6 +150,6 @@ def open_kind(settings: ReplaySettings, session: Session) -> ReplayRig:
     return kind(recording, tolerance=settings.tolerance)
 
 
-def reached_by(settings: ReplaySettings) -> Reach:
+def reach_of(settings: ReplaySettings) -> Reach:
     """Return the recording."""
     return Reach(files=(settings.recording,))

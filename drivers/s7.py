@@ -167,7 +167,7 @@ class S7Link:
             return held, 2.0 * (time.perf_counter() - middle_s)
 
         (held, took_s), attempts = self._exchange(ask)
-        return Answer([word for name in names for word in self._shown(name, held[name])], attempts > 1, took_s)
+        return Answer([word for name in names for word in self._words_of(name, held[name])], attempts > 1, took_s)
 
     def write(self, table: str, address: int, words: Sequence[int]) -> bool:
         """Write places whose registers lie side by side in the map, in as few requests as their addresses allow.
@@ -199,7 +199,7 @@ class S7Link:
 
         return self._exchange(ask)[1] > 1
 
-    def _shown(self, name: str, data: bytes) -> Sequence[int]:
+    def _words_of(self, name: str, data: bytes) -> Sequence[int]:
         part = self._parts[name]
         if part.is_bit:
             return (data[0] >> part.place.bit & 1,)

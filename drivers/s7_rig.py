@@ -49,7 +49,7 @@ def open_kind(settings: S7Settings, session: Session) -> Rig:
     return open_registers(_link(settings), settings, session, TypedGainRig)
 
 
-def reached_by(settings: S7Settings) -> Reach:
+def reach_of(settings: S7Settings) -> Reach:
     """Return the CPU's address."""
     return Reach(address=(settings.host, settings.port), timeout_s=settings.timeout_s)
 

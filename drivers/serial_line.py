@@ -189,7 +189,7 @@ class SerialLink:
         self._sequence = (self._sequence + 1) & 0xFFFF
         self._write(encode(Frame(kind=kind, sequence=self._sequence, values=values)))
 
-    def arrived(self, timeout_s: float) -> Frame | None:
+    def next_frame(self, timeout_s: float) -> Frame | None:
         """Return the next frame that the device sent by itself, None where none comes within ``timeout_s`` [s]."""
         until = self._clock.now() + timeout_s
         while not self._arrived:

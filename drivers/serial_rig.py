@@ -302,12 +302,12 @@ class SerialLineRig:
             if refusal.reason != NOT_IN_COMMAND:
                 raise
             frame, *_ = self._link.ask(Kind.READ)  # which says why
-            raise self._ended(self._state(frame)) from None
+            raise self._reason_of_end(self._state(frame)) from None
         end_s = self._clock.now()
         state = self._state(frame)
         if self._is_commanding and state & COMMAND != Command.HOST:
             self._is_commanding = False
-            raise self._ended(state)
+            raise self._reason_of_end(state)
         device_time_s = self._steady(frame.values[0], end_s, end_s - sent_s)
         reading = self._reading(frame, device_time_s, end_s, end_s - sent_s)
         return replace(reading, latency_s=end_s - start_s, suspect=suspect)
@@ -329,7 +329,7 @@ class SerialLineRig:
             raise LinkError("the device restarted", where=self._link.where, remedy="check its power, then start again")
         return int(frame.values[3])
 
-    def _ended(self, state: int) -> LinkError:
+    def _reason_of_end(self, state: int) -> LinkError:
         why = "the device took the actuator back"
         remedy = "somebody else commands it: look who, then start again"
         if state & _DEADMAN:
@@ -345,7 +345,7 @@ class SerialLineRig:
     def _steady(self, stamp_us: float, received_s: float, latency_s: float) -> float:
         """Return the device time [s] of a sample, once it is known to have gone on with the host's."""
         before_s = self._device_time_s
-        passed_s, host_s = self._unwrapped(stamp_us) - before_s, received_s - self._received_s
+        passed_s, host_s = self._unwrap_stamp(stamp_us) - before_s, received_s - self._received_s
         slack_s = self._latency_s + latency_s + _CLOCK_ERROR * host_s + _CLOCK_SLACK_S
         if abs(passed_s - host_s) > slack_s:
             raise LinkError(
@@ -356,7 +356,7 @@ class SerialLineRig:
         self._received_s, self._latency_s = received_s, latency_s
         return self._device_time_s
 
-    def _unwrapped(self, stamp_us: float) -> float:
+    def _unwrap_stamp(self, stamp_us: float) -> float:
         """Return the device time [s] whose low 32 bits of microseconds are given."""
         turns = round((self._device_time_s - 1e-6 * stamp_us) / _WRAP_S)
         self._device_time_s = 1e-6 * stamp_us + turns * _WRAP_S

@@ -134,7 +134,7 @@ class OpcUaRig(ServedRig):
         folder = await server.nodes.objects.add_object(space, "Ball")
         for name, one in self._nodes.items():
             kind = _VARIANTS[one.type]
-            first = self._shown(name, kind).Value
+            first = self._data_value(name, kind).Value
             node = await folder.add_variable(ua.NodeId.from_string(one.node), f"{space}:{name}", first)
             if one.writable:
                 await node.set_writable()
@@ -142,9 +142,9 @@ class OpcUaRig(ServedRig):
             server.set_attribute_value_callback(node.nodeid, partial(self._show, name, kind))
 
     def _show(self, name: str, kind: ua.VariantType, _id: ua.NodeId, _attribute: Any) -> ua.DataValue:
-        return self._shown(name, kind)
+        return self._data_value(name, kind)
 
-    def _shown(self, name: str, kind: ua.VariantType) -> ua.DataValue:
+    def _data_value(self, name: str, kind: ua.VariantType) -> ua.DataValue:
         spec = self.device.registers[name]
         words = self.device.read(spec.table, spec.address, spec.size, self.now_s)
         count = (from_words(words, spec) - spec.offset) / spec.scale

@@ -201,7 +201,7 @@ class RegisterDevice:
         self.live(now_s)
         # each once: a measurement must not change between its words
         names = dict.fromkeys(name for place in places for name, _ in self._at[place])
-        shown = {name: to_words(self._shown(name), self.registers[name]) for name in names}
+        shown = {name: to_words(self._value(name), self.registers[name]) for name in names}
         return [self._word(place, shown) for place in places]
 
     def write(self, table: Table, address: int, words: Sequence[int], now_s: float) -> None:
@@ -241,7 +241,7 @@ class RegisterDevice:
             raise IllegalValue(f"{table} {address}: locked")
         self._words |= dict(zip(places, words, strict=True))
         for name, taken in values.items():
-            if self.registers[name].bit is None or taken != self._shown(name):  # a word's other bits came along
+            if self.registers[name].bit is None or taken != self._value(name):  # a word's other bits came along
                 self._take(name, taken)
 
     @property
@@ -270,7 +270,7 @@ class RegisterDevice:
             )
         return word | self._words.get(place, 0) & ~known
 
-    def _shown(self, name: str) -> float:
+    def _value(self, name: str) -> float:
         match name:
             case "y":
                 return self.plant.measure()

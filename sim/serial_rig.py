@@ -140,7 +140,7 @@ class SerialRig:
         if len(content) < 6 or struct.pack("<H", _crc(content[:-2])) != content[-2:] or content[0] != _VERSION:
             return b""
         kind, payload = content[1], content[4:-2]
-        reason = self._obeyed(kind, payload)
+        reason = self._obey(kind, payload)
         if reason:
             return bytes((_VERSION, 0xFF)) + content[2:4] + bytes((kind, reason))
         if kind == 0x01:
@@ -158,7 +158,7 @@ class SerialRig:
             answer, body = 0x82, self._sample
         return bytes((_VERSION, answer)) + content[2:4] + body
 
-    def _obeyed(self, kind: int, payload: bytes) -> int:
+    def _obey(self, kind: int, payload: bytes) -> int:
         """Do what has to be done before the sample is taken; return the reason of a refusal, or 0."""
         size = {1: 0, 2: 8, 3: 0, 4: 2, 5: 0, 7: 14, 8: 0, 9: 8, 11: 0}.get(kind)
         if size is None or len(payload) != size:

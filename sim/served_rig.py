@@ -64,13 +64,13 @@ class ServedRig:
 
     def _run(self) -> None:
         try:
-            asyncio.run(self._served())
+            asyncio.run(self._serve_until_stopped())
         except Exception as failure:  # whatever it is, the thread that waits raises it
             self._failure = failure
         finally:
             self._ready.set()
 
-    async def _served(self) -> None:
+    async def _serve_until_stopped(self) -> None:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         await self._serve(self._stop)
 

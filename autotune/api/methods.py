@@ -160,11 +160,11 @@ def tune(
 
 def _of_recordings(records: list[Recording], settings: dict[str, Any]) -> Design:
     from autotune.config.procedure import DesignSettings
-    from autotune.pipeline import analyse, measured_of
-    from autotune.schema import validated
+    from autotune.pipeline import analyse, measure_plant
+    from autotune.schema import validate
 
-    asked = validated(DesignSettings, settings, "tune, of a recording")
-    measured = measured_of(records)
+    asked = validate(DesignSettings, settings, "tune, of a recording")
+    measured = measure_plant(records)
     return analyse(measured.points, asked, fit=measured.fit, facts=measured.facts, compare=False).design
 
 

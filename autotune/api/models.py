@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from autotune.arguments import checked
+from autotune.arguments import check_arguments
 from autotune.arrays import FloatArray
 from autotune.equations.black_box import BlackBox
 from autotune.equations.model import EquationModel
@@ -17,7 +17,7 @@ class Model:
     """Makers of models for ``simulate`` and ``diagnose``; none of what they return is an object of this class."""
 
     @staticmethod
-    @checked
+    @check_arguments
     def read(path: str | os.PathLike[str]) -> Chain | EquationModel | BlackBox:
         """Return what a model file holds: a chain of blocks, equations, or an FMU with its inputs and parameters."""
         from autotune.model_file import read_any as read_any_model
@@ -25,7 +25,7 @@ class Model:
         return read_any_model(path)
 
     @staticmethod
-    @checked
+    @check_arguments
     def from_equations(content: Mapping[str, Any], name: str = "model") -> EquationModel:
         """Return equations from a mapping with the keys of a model file: ``input``, ``output``, ``state``, ..
 
@@ -41,7 +41,7 @@ class Model:
         return equations_of({"name": name, **content}, str(content.get("name", name)))
 
     @staticmethod
-    @checked
+    @check_arguments
     def from_control(system: Any, name: str = "") -> Chain | EquationModel:
         """Return a continuous system of python-control: a chain, or equations where it has several inputs.
 
@@ -57,7 +57,7 @@ class Model:
         return from_control(system, name)
 
     @staticmethod
-    @checked
+    @check_arguments
     def from_text(text: str, name: str = "plant") -> Chain:
         """Return a transfer function as people write it: ``-65.5/(s(0.36s+1)) e^-0.1s``, zpk, gain and lags.
 
@@ -75,7 +75,7 @@ class Model:
         return from_coefficients(tf.num, tf.den, tf.delay_s, name)
 
     @staticmethod
-    @checked
+    @check_arguments
     def from_function(
         step: Callable[[Any, FloatArray, Mapping[str, float], float], tuple[Any, float]],
         state: Any,

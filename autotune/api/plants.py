@@ -26,13 +26,13 @@ def as_plant(source: Any) -> TransferFunction:
         Nothing of these, or a system in discrete time.
     """
     if isinstance(source, TransferFunction):
-        return _checked(source)
+        return _require_proper(source)
     if isinstance(source, str | os.PathLike):
-        return _checked(read_model(source).transfer_function())
+        return _require_proper(read_model(source).transfer_function())
     if isinstance(source, Model) or hasattr(source, "transfer_function"):
-        return _checked(source.transfer_function())
+        return _require_proper(source.transfer_function())
     if hasattr(source, "dt"):  # python-control's mark of a system
-        return _checked(from_control(source))
+        return _require_proper(from_control(source))
     raise InputError(
         f"a {type(source).__name__} is no plant",
         where="plant",
@@ -40,7 +40,7 @@ def as_plant(source: Any) -> TransferFunction:
     )
 
 
-def _checked(plant: Any) -> TransferFunction:
+def _require_proper(plant: Any) -> TransferFunction:
     if not isinstance(plant, TransferFunction):
         raise InputError("a system in discrete time", where="plant", remedy="give the plant in continuous time")
     if not plant.is_proper:

@@ -85,12 +85,12 @@ def _points(omega: FloatArray, response: ComplexArray, system: Any) -> Points:
     if measured and same:
         return Points(measured, measured.notes)
     return Points(
-        (_known(float(w), complex(g)) for w, g in zip(omega, response, strict=True)),
+        (_known_point(float(w), complex(g)) for w, g in zip(omega, response, strict=True)),
         ["an FRD has no covariance: a thousandth of each gain is taken for its standard deviation"],
     )
 
 
-def _known(omega: float, gain: complex) -> FrequencyPoint:
+def _known_point(omega: float, gain: complex) -> FrequencyPoint:
     variance = (1e-3 * abs(gain)) ** 2
     return FrequencyPoint(
         omega_rad_s=omega, response=gain, covariance=((variance, 0.0), (0.0, variance)), source="python-control"

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from autotune.arguments import checked
+from autotune.arguments import check_arguments
 from autotune.arrays import FloatArray
 from autotune.errors import InputError
 from autotune.recording import Recording, usable
@@ -20,7 +20,7 @@ Source: TypeAlias = Any
 _OTHER_FILES = ("", ".toml", ".json", ".fmu")
 
 
-@checked
+@check_arguments
 def read(source: Source, *, t: str = "", u: str = "", y: str = "", r: str = "", name: str = "") -> Recording:
     """Return a recording of the command u and the measurement y over the time t.
 

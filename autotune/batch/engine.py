@@ -67,7 +67,7 @@ def cluster(workers: int | None = None, scheduler: str | None = None, *, process
             yield client
         return
     try:
-        asyncio.run(_reached(scheduler))
+        asyncio.run(_require_answer(scheduler))
         client = Client(scheduler, timeout=_PATIENCE_S)
     except (OSError, ValueError) as error:
         raise InputError(f"no scheduler answers ({error})", where=scheduler, remedy="start dask scheduler") from None
@@ -79,7 +79,7 @@ def cluster(workers: int | None = None, scheduler: str | None = None, *, process
         yield client
 
 
-async def _reached(scheduler: str) -> None:
+async def _require_answer(scheduler: str) -> None:
     """Ask whether a scheduler answers, before a client is made.
 
     A client whose making failed closes itself when it is collected; where that happens in the thread of the next one's

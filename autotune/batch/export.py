@@ -14,7 +14,7 @@ from autotune.errors import InputError
 from autotune.files.cells import Cells
 from autotune.files.signal_names import Roles, SignalNames, find_roles
 from autotune.files.stamps import seconds
-from autotune.files.table import Table, listed
+from autotune.files.table import Table, list_names
 from autotune.files.table_signals import Signals, signals_of, stamp_form, stamps_of
 from autotune.files.text_file import beginning
 from autotune.files.workbook import PARQUET, open_table, parquet_table
@@ -85,7 +85,7 @@ def _roles(table: Table, loop: LoopSettings, export: ExportSettings) -> Roles:
     found = find_roles(table, SignalNames(t=export.time, r=r, **said))
     if found.unsure:
         raise InputError(
-            f"which column is {' and '.join(found.unsure)} is not sure; it has {listed(table.names)}",
+            f"which column is {' and '.join(found.unsure)} is not sure; it has {list_names(table.names)}",
             where=table.path,
             remedy="name them with u and y of the loop, and time in [export]",
         )

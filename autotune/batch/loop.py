@@ -31,7 +31,7 @@ from autotune.identification.frequency.recorded import combine, frequency_points
 from autotune.identification.frequency.spectral_points import FrequencyEstimate
 from autotune.identification.parametric import PlantFit
 from autotune.model_file import read_model
-from autotune.pipeline import Analysis, Measured, analyse, analysis_json, measured_of
+from autotune.pipeline import Analysis, Measured, analyse, analysis_json, measure_plant
 from autotune.points import FrequencyPoint, points_to_json
 from autotune.recording import Recording
 from autotune.whole_files import jsonable
@@ -140,7 +140,7 @@ def _finding(work: Work, row: Row) -> Finding:
         found = with_next_experiment(diagnose(model, pieces, present))
         return Finding(row=_add_diagnosis(row, found), result=found.as_json())
     if settings.task == "design" and settings.method == "frequency":
-        measured = measured_of(record.pieces)
+        measured = measure_plant(record.pieces)
     else:
         points, fit, notes = _points(record, settings, present)
         measured = Measured(points=points, fit=fit, facts=LoopFacts(), notes=notes)

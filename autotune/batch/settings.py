@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from autotune.config import validated
+from autotune.config import validate
 from autotune.config.procedure import DesignSettings
 from autotune.errors import InputError
 from autotune.files.cells import GOOD
@@ -176,13 +176,13 @@ def read_campaign(path: str | os.PathLike[str]) -> tuple[CampaignSettings, tuple
         A file that cannot be read, a key that is refused, a name given twice, or no loop; names the row.
     """
     path = Path(path).absolute()
-    file = validated(_CampaignFile, read_toml(path), str(path))
+    file = validate(_CampaignFile, read_toml(path), str(path))
     settings = CampaignSettings(**{key: getattr(file, key) for key in CampaignSettings.model_fields})
     rows = [
         (where, {key: value for key, value in (file.defaults | row).items() if value != ""})
         for where, row in _rows(file, path)
     ]
-    loops = tuple(validated(LoopSettings, row, where, texts=bool(file.loops)) for where, row in rows)
+    loops = tuple(validate(LoopSettings, row, where, texts=bool(file.loops)) for where, row in rows)
     if not loops:
         raise InputError("no loop", where=str(path), remedy=f"nothing matches {file.folder or file.loops}")
     twice = [name for name, times in Counter(loop.name for loop in loops).items() if times > 1]

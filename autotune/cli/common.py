@@ -47,7 +47,7 @@ def rig_of(config: Config, dry_run: bool = False, speed: float | None = None) ->
     )
 
 
-def unguarded(config: Config) -> str:
+def warn_of_no_dead_man(config: Config) -> str:
     """Return what is to be known of a rig whose device no one is known to make safe; empty where a dead-man is mapped.
 
     Parameters
@@ -65,7 +65,7 @@ def unguarded(config: Config) -> str:
     )
 
 
-def kept_code() -> tuple[Path, int]:
+def count_compiled() -> tuple[Path, int]:
     """Return the folder in which compiled functions are kept, and how many of this Python are there.
 
     Returns
@@ -85,7 +85,7 @@ def kept_code() -> tuple[Path, int]:
 
 def announce_compiling() -> None:
     """Say why the first call after an installation takes so long, before it does."""
-    folder, kept = kept_code()
+    folder, kept = count_compiled()
     # where the package cannot be written the compiler keeps its code elsewhere, and nothing is known of it
     if not kept and (os.environ.get("NUMBA_CACHE_DIR") or os.access(folder, os.W_OK)):
         typer.echo("note: compiling, once after an installation: about half a minute", err=True)

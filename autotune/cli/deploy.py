@@ -70,7 +70,7 @@ def deploy(
     from autotune.pipeline.audit import audit_log
     from autotune.pipeline.deployment import deploy as hand_over
     from autotune.pipeline.folder import JOURNAL, next_free
-    from autotune.pipeline.held_gains import held_by
+    from autotune.pipeline.held_gains import round_to_rig
     from autotune.pipeline.result import verification_json, write_json
     from autotune.pipeline.sensible_gains import require_sensible
     from autotune.report.page import write_page
@@ -81,7 +81,7 @@ def deploy(
     new = _gains(controller, design, run)
     measured, fit = _plant(run, points) if verify or run is not None or points is not None else (None, None)
     rig = _with_gains(rig_of(content))
-    new = held_by(rig, new, content.design, fit=fit)
+    new = round_to_rig(rig, new, content.design, fit=fit)
     if not yes and not sys.stdin.isatty():
         raise InputError(
             "nobody can be asked here", where="autotune deploy", remedy="look at the gains, then give --yes"

@@ -113,7 +113,7 @@ def _on_points(points: Path, asked: Callable[..., Specification], kind: Literal[
     from autotune.design.on_fit import design_on_fit
     from autotune.design.specification import UNCERTAIN
     from autotune.identification.closed_loop.loop_plant import read_loop_region
-    from autotune.identification.frequency.thinning import said, thinned
+    from autotune.identification.frequency.thinning import thin_points, thinning_note
     from autotune.identification.parametric import fit_plant
     from autotune.pipeline.analysis import of_use, on_measured
     from autotune.points import read_points, require_regions
@@ -126,8 +126,8 @@ def _on_points(points: Path, asked: Callable[..., Specification], kind: Literal[
     from_file = read_points(points)
     require_regions(from_file, str(points))
     given = of_use(from_file)
-    measured = list(thinned(given))
-    for note in said(len(given), len(measured)):
+    measured = list(thin_points(given))
+    for note in thinning_note(len(given), len(measured)):
         typer.echo(f"note: {note}")
     fit = fit_plant(measured)
     source, designed, looked = on_measured(measured, fit, asked(fit.plant, measured[-1].omega_rad_s), kind)

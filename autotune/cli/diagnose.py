@@ -155,7 +155,7 @@ def diagnose(
                 lambda what, share: progress.update(task, description=what, completed=share),
             )
         )
-    with place.filled() as folder:
+    with place.write_all() as folder:
         found.write(folder / "diagnosis.json")
         write_any(found.extended_model, folder / "extended_model.toml", base=model.parent)
         write_diagnosis_page(found, folder / "report.html", law)

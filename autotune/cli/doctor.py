@@ -19,7 +19,7 @@ from packaging.requirements import Requirement
 from rich.console import Console
 
 from autotune.cli import app
-from autotune.cli.common import kept_code, unguarded
+from autotune.cli.common import count_compiled, warn_of_no_dead_man
 from autotune.errors import InputError
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def _extra() -> Check:
 
 def _check_compiled() -> Check:
     """Say whether the inner loops are compiled already, and whether they can be kept."""
-    own, kept = kept_code()
+    own, kept = count_compiled()
     subject = "compiled code"
     # where the package cannot be written the compiler keeps its code in the user's cache folder
     places = [own] if os.environ.get("NUMBA_CACHE_DIR") else [own, Path.home()]
@@ -195,7 +195,7 @@ def _is_real(content: Config) -> bool:
     """Return whether the rig's time goes on by itself: it is not in this process."""
     from drivers.kinds import Reach, kind_of
 
-    reach = kind_of(content.rig).reached_by(content.rig)
+    reach = kind_of(content.rig).reach_of(content.rig)
     return reach.address is not None or reach.device != Reach().device
 
 
@@ -204,12 +204,12 @@ def _scheduling(sample_time_s: float, late_s: float, *, is_needed: bool) -> Iter
 
     Too many missed deadlines are wrong where a rig needs them.
     """
-    from autotune.cli.lateness import real_time_priority, tried
-    from autotune.experiment.priority import undisturbed
+    from autotune.cli.lateness import measure_lateness, real_time_priority
+    from autotune.experiment.priority import raise_priority
     from drivers.clock import MonotonicClock
 
-    with undisturbed(MonotonicClock()):  # as a run tries it
-        found = tried(sample_time_s)
+    with raise_priority(MonotonicClock()):  # as a run tries it
+        found = measure_lateness(sample_time_s)
     priority, how = real_time_priority()
     is_good = found.late_s <= 0.5 * found.period_s and found.worst_s <= max(late_s, 5.0 * sample_time_s)
     # a run rides through a late sample; many, or one that is too late, end it
@@ -257,14 +257,14 @@ def _rig(content: Config) -> Iterator[Check]:
     """Look for the rig of a configuration: its device, its address, its files. Nothing is sent to it."""
     from drivers.kinds import Reach, kind_of
 
-    reach = kind_of(content.rig).reached_by(content.rig)
+    reach = kind_of(content.rig).reach_of(content.rig)
     yield from (_file(name) for name in reach.files)
     if reach.address is not None:
         yield _address(*reach.address, reach.timeout_s)
     if reach.device:
         check = _permission("the rig's port", reach.device)
         yield replace(check, verdict="wrong") if check.remedy else check  # this port is needed, others are not
-    if warning := unguarded(content):
+    if warning := warn_of_no_dead_man(content):
         what, remedy = warning.split("; ")
         yield Check(subject="dead-man", found=what, verdict="note", remedy=remedy)
     if reach == Reach():

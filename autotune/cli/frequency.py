@@ -90,7 +90,7 @@ def reduce(
     place = Output(out, inputs=(points, model), overwrite=overwrite)  # refused before the method is imported
     if (points is None) == (model is None):
         raise InputError("give one of --points and --model", where="autotune reduce")
-    from autotune.identification.frequency.thinning import said, thinned
+    from autotune.identification.frequency.thinning import thin_points, thinning_note
     from autotune.identification.reduced_file import write_reduced
     from autotune.identification.reduction import reduce_points, reduce_transfer_function
     from autotune.points import read_points, require_regions
@@ -108,8 +108,8 @@ def reduce(
         known = (static_gain, static_gain_sd if static_gain_sd is not None else 0.01 * abs(static_gain))
     given = read_points(points)
     require_regions(given, str(points))
-    few = thinned(given)
-    for note in said(len(given), len(few)):
+    few = thin_points(given)
+    for note in thinning_note(len(given), len(few)):
         typer.echo(f"note: {note}")
     reduced = reduce_points(few, kind=None if kind == "auto" else kind, conditions=conditions, static_gain=known)
     place.by(lambda part: write_reduced(reduced, part))

@@ -138,7 +138,7 @@ def init(
     u: Annotated[float | None, typer.Option(help="command that holds y there, about [u unit]")] = None,
 ) -> None:
     """Write a commented configuration; asks at a terminal for what no flag says."""
-    from autotune.config import Config, validated
+    from autotune.config import Config, validate
     from autotune.config.rig import SimulatedRigSettings
     from drivers.kinds import KINDS
 
@@ -191,7 +191,7 @@ def init(
         content = _real(reached | (played if simulated else {"twin": played} if played else {}), answers)
     content = {"name": config.stem, **content}
     set_keys(content, keys or ())
-    validated(Config, content, str(config))
+    validate(Config, content, str(config))
     place = Output(config)
     written = twin.write(config, answers) if isinstance(twin, ModelOfRig) else None
     place.text(text_of(content, config))

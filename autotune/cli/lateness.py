@@ -45,7 +45,7 @@ class Lateness:
         )
 
 
-def tried(sample_time_s: float) -> Lateness:
+def measure_lateness(sample_time_s: float) -> Lateness:
     """Keep absolute deadlines as a run keeps them, and return how late they were met.
 
     Parameters

@@ -33,12 +33,12 @@ def live(
 
     require_extra("live", "nicegui")
     from autotune.live.server import Run, listening, serve, token_for
-    from autotune.live.session import given_token
+    from autotune.live.session import read_token
     from autotune.pipeline import PROGRESS
 
     if not beside_run and not (folder / PROGRESS).is_file():
         raise InputError(f"holds no {PROGRESS}", where=str(folder), remedy="give the --out folder of autotune run")
-    token = token_for(given_token(token_file))
+    token = token_for(read_token(token_file))
     bound = listening(listen, port)
     host = socket.gethostname() if listen in ("0.0.0.0", "::") else f"[{listen}]" if ":" in listen else listen
     url = f"http://{host}:{bound.getsockname()[1]}/?token={token}"

@@ -129,13 +129,13 @@ def export(
 ) -> None:
     """Write a model for another tool, its effects written out as equations."""
     from autotune.equations.exports import as_modelica, as_python, as_text
-    from autotune.equations.flatten import flattened
+    from autotune.equations.flatten import flatten
     from autotune.equations.typeset import as_latex
 
     place = Output(out, inputs=(model,), overwrite=overwrite)
     equations = _equations(model)
     if form == "toml":
-        _write(flattened(equations), place)
+        _write(flatten(equations), place)
         return
     text = {"text": as_text, "latex": as_latex, "modelica": as_modelica, "python": as_python}[form](equations)
     place.text(text)

@@ -43,11 +43,11 @@ def prove_recorded(folder: Path, out: Path, cases: int | None, seed: int, worker
         No rig can be used; the campaign was begun with others; an answer changed after it was sealed.
     """
     from sim.proof import seal
-    from sim.recorded.campaign import conceal, mark_all, opened
+    from sim.recorded.campaign import conceal, mark_all, open_campaign
     from sim.recorded.rigs import RefusedError
 
     try:
-        campaign = opened(folder, out, cases, seed, (sys.executable, "-m", "autotune.cli"))
+        campaign = open_campaign(folder, out, cases, seed, (sys.executable, "-m", "autotune.cli"))
     except RefusedError as why:
         raise InputError(
             str(why),

@@ -150,7 +150,7 @@ def import_file(
     first = out or Path(f"{file.stem}_recording.csv")
     paths = [first, *(first.with_stem(f"{first.stem}_{i}") for i in range(2, len(reading.recordings) + 1))]
     names = [name for path in paths for name in (path.name, path.with_suffix(".toml").name)]
-    with OutputFolder(first.parent, names, inputs=(file,)).filled() as folder:
+    with OutputFolder(first.parent, names, inputs=(file,)).write_all() as folder:
         for path, recording in zip(paths, reading.recordings, strict=True):
             kept = replace(recording, metadata={**recording.metadata, "notes": list(reading.notes)})
             write_recording(kept, folder / path.name)

@@ -34,7 +34,7 @@ _CONFIG = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configurat
 @app.command()
 def rig(config: _CONFIG) -> None:
     """Serve the config's simulated plant over its real transport, until stopped by Ctrl-C."""
-    from autotune.cli.served import device_of, modbus_settings, served, served_on_line, served_opcua, served_s7
+    from autotune.cli.served import device_of, modbus_settings, serve_modbus, serve_opcua, serve_s7, serve_serial_line
     from autotune.config import load_config
     from autotune.config.rig import OpcUaSettings, SerialSettings
     from autotune.config.s7 import S7Settings
@@ -46,17 +46,17 @@ def rig(config: _CONFIG) -> None:
     with ExitStack() as serving:
         serving.enter_context(signals_heard(signal.SIGINT, signal.SIGTERM, by=heard.append))
         if isinstance(content.rig, SerialSettings):
-            server: ServedRig | SerialRig = serving.enter_context(served_on_line(content, content.rig))
+            server: ServedRig | SerialRig = serving.enter_context(serve_serial_line(content, content.rig))
             said = f"a microcontroller on {content.rig.device}"
         elif isinstance(content.rig, OpcUaSettings):
-            server = serving.enter_context(served_opcua(content, content.rig))
+            server = serving.enter_context(serve_opcua(content, content.rig))
             said = f"OPC UA on {content.rig.endpoint}"
         elif isinstance(content.rig, S7Settings):
-            server = serving.enter_context(served_s7(content, content.rig))
+            server = serving.enter_context(serve_s7(content, content.rig))
             said = f"a Siemens CPU on {content.rig.twin.listen if content.rig.twin else ''}:{content.rig.port}"
         else:
             settings = modbus_settings(content)
-            modbus = server = serving.enter_context(served(content, device_of(content)))
+            modbus = server = serving.enter_context(serve_modbus(content, device_of(content)))
             console.print(_registers_of(content.name, settings))
             said = f"{_address(settings, modbus.port)}, unit {settings.unit_id}"
         spare_collections()  # a real plant does not stop for one
@@ -82,7 +82,7 @@ def probe(config: _CONFIG) -> None:
     from drivers.probe import ProbedDevice
 
     content = load_config(config)
-    found = kind_of(content.rig).probe(content.rig, _expected(content))
+    found = kind_of(content.rig).probe(content.rig, _plausible_ranges(content))
     units = _units(content)
     if isinstance(found, ProbedDevice):
         _print_device(content.name, found, units)
@@ -166,7 +166,7 @@ def _address(settings: AnyModbusSettings, port: int) -> str:
     return f"Modbus {'TLS' if settings.kind == 'modbus_tls' else 'TCP'} on {listen}:{port}"
 
 
-def _expected(config: Config) -> dict[str, tuple[float, float]]:
+def _plausible_ranges(config: Config) -> dict[str, tuple[float, float]]:
     """Return where values are plausible; y may lie outside its limits while the rig is at rest."""
     limits = config.limits
     span = limits.y_max - limits.y_min

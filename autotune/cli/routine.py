@@ -60,7 +60,7 @@ def look_at(
         found = diagnose_routine(
             data, progress=lambda what, share: progress.update(task, description=what, completed=share)
         )
-    with place.filled() as folder:
+    with place.write_all() as folder:
         found.write(folder / "routine.json")
         write_routine_page(found, folder / "report.html")
     for sentence in (*found.sentences, found.following):

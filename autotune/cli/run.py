@@ -12,7 +12,7 @@ import typer
 from rich.console import Console
 
 from autotune.cli import app
-from autotune.cli.common import OVERWRITE, ProgressBar, new_folder, rig_of, unguarded
+from autotune.cli.common import OVERWRITE, ProgressBar, new_folder, rig_of, warn_of_no_dead_man
 from autotune.cli.live import LISTEN, PORT, TOKEN_FILE
 from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
 from autotune.errors import ExperimentStopped, InputError
@@ -62,7 +62,7 @@ def run(
 ) -> None:
     """Commission a rig: relay sweep, Bode points, reduced model, controller, verification, report."""
     content = _configuration(config, out, resume, dry_run)  # a mistake there is told before the method is imported
-    from autotune.live.session import LivePage, given_token
+    from autotune.live.session import LivePage, read_token
     from autotune.pipeline import tune
     from autotune.pipeline.folder import FILES_OF_A_RUN, may_store
     from autotune.recording import read_recording
@@ -75,9 +75,9 @@ def run(
         may_store(content, out)
     folder = out or resume or Path()
     console = Console(highlight=False, soft_wrap=True)
-    if warning := unguarded(content):
+    if warning := warn_of_no_dead_man(content):
         console.print(f"warning: {warning}", markup=False)
-    with LivePage(folder, listen, port, given_token(token_file)) if live else nullcontext() as onlooker:
+    with LivePage(folder, listen, port, read_token(token_file)) if live else nullcontext() as onlooker:
         keep = onlooker.keep if onlooker is not None else None
         with _page_where_stopped(content, folder), ProgressBar() as bar:
             tuning = tune(
@@ -116,14 +116,14 @@ def _page_where_stopped(config: Config, folder: Path) -> Iterator[None]:
     from autotune.pipeline.folder import RECORDING, VERIFICATION, recordings
     from autotune.recording import read_recording
     from autotune.report.page import write_page
-    from autotune.report.run_page import stopped_page
+    from autotune.report.run_page import stopped_run_page
 
     try:
         yield
     except ExperimentStopped as error:
         with suppress(InputError, OSError):  # a recording of no rows, a full disk: the line says it all
             files = (*recordings(folder, RECORDING), *recordings(folder, VERIFICATION))
-            page = stopped_page(config.name, config.signals, [read_recording(file) for file in files], str(error))
+            page = stopped_run_page(config.name, config.signals, [read_recording(file) for file in files], str(error))
             write_page(page, folder / "report.html")
         raise
 
@@ -137,9 +137,9 @@ def _configuration(config: Path | None, out: Path | None, resume: Path | None, d
     if config is not None:
         content = load_config(config)
     elif resume is not None:
-        from autotune.pipeline.folder import stored_config
+        from autotune.pipeline.folder import read_stored_config
 
-        content = stored_config(resume)
+        content = read_stored_config(resume)
     else:
         raise InputError("CONFIG.toml is missing", where="autotune run", remedy="autotune run CONFIG.toml --out DIR")
     if not dry_run:
@@ -239,11 +239,11 @@ def tune(
     """Design a controller from recordings and points, without a rig: model, controller, checks, report."""
     from autotune.config.procedure import DesignSettings, SignalSettings
     from autotune.controller import write_controller
-    from autotune.pipeline import CONTROLLER, RESULT, analyse, analysis_json, measured_of
+    from autotune.pipeline import CONTROLLER, RESULT, analyse, analysis_json, measure_plant
     from autotune.points import read_points, require_regions
     from autotune.report.page import write_page
     from autotune.report.tuned_page import analysis_page
-    from autotune.schema import validated
+    from autotune.schema import validate
 
     recordings, files = recordings or [], points or []
     if not recordings and not files:
@@ -257,7 +257,7 @@ def tune(
         "sample_time_s": sample_time,
     }
     given_options = {name: value for name, value in options.items() if value is not None}
-    asked = validated(
+    asked = validate(
         DesignSettings,
         {"kind": kind, "specification": specification, "source": source, "criterion": criterion, **given_options},
         "autotune tune",
@@ -268,7 +268,7 @@ def tune(
     if given and not read:
         require_regions(given, ", ".join(map(str, files)))
     with ProgressBar() as bar:
-        found = measured_of(read, given, bar.work)
+        found = measure_plant(read, given, bar.work)
         analysis = analyse(found.points, asked, fit=found.fit, facts=found.facts, progress=bar.work)
     notes = found.notes
     units = read[0].metadata.get("units", {}) if read else {}
@@ -279,7 +279,7 @@ def tune(
     )
     name, now = ", ".join(path.stem for path in (*recordings, *files)), datetime.now().astimezone()
     page = analysis_page(name, signals, read, analysis, notes, present=today, made=now)
-    with place.filled() as folder:
+    with place.write_all() as folder:
         write_json(folder / RESULT, analysis_json(analysis))
         write_controller(analysis.controller, folder / CONTROLLER)
         write_page(page, folder / "report.html")

@@ -133,7 +133,7 @@ def _form_of(config: Config, registers: RegisterMap) -> dict[str, Any]:
 
 
 @contextmanager
-def served(config: Config, device: RegisterDevice, *, refuse: Refusal | None = None) -> Iterator[ModbusRig]:
+def serve_modbus(config: Config, device: RegisterDevice, *, refuse: Refusal | None = None) -> Iterator[ModbusRig]:
     """Serve a device at the address of the configuration until the context ends.
 
     Parameters
@@ -171,7 +171,7 @@ def served(config: Config, device: RegisterDevice, *, refuse: Refusal | None = N
 
 
 @contextmanager
-def served_opcua(config: Config, settings: OpcUaSettings, users: Mapping[str, str] | None = None) -> Iterator[OpcUaRig]:
+def serve_opcua(config: Config, settings: OpcUaSettings, users: Mapping[str, str] | None = None) -> Iterator[OpcUaRig]:
     """Serve the configuration's twin behind an OPC UA server at its endpoint until the context ends.
 
     Parameters
@@ -210,7 +210,7 @@ def served_opcua(config: Config, settings: OpcUaSettings, users: Mapping[str, st
 
 
 @contextmanager
-def served_s7(config: Config, settings: S7Settings) -> Iterator[S7Rig]:
+def serve_s7(config: Config, settings: S7Settings) -> Iterator[S7Rig]:
     """Serve the configuration's twin as a Siemens CPU at its address until the context ends.
 
     Parameters
@@ -243,7 +243,7 @@ def s7_places(settings: S7Settings) -> dict[str, ServedPlace]:
 
 
 @contextmanager
-def served_on_line(config: Config, settings: SerialSettings) -> Iterator[SerialRig]:
+def serve_serial_line(config: Config, settings: SerialSettings) -> Iterator[SerialRig]:
     """Serve the configuration's twin as a microcontroller on a serial line until the context ends.
 
     Parameters

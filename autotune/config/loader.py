@@ -21,10 +21,10 @@ from autotune.config.procedure import (
 )
 from autotune.config.registers import RegisterMap, RegisterSettings
 from autotune.config.rig import RigSettings
-from autotune.schema import Section, Text, validated
+from autotune.schema import Section, Text, validate
 from autotune.text_files import read_toml
 
-__all__ = ["Config", "json_schema", "load_config", "validated"]
+__all__ = ["Config", "json_schema", "load_config", "validate"]
 
 
 #: Samples that a sweep has at least.
@@ -56,7 +56,7 @@ class Config(Section):
         """Cut the limits inwards to what the command's register can hold, and command in its steps."""
         registers = getattr(self.rig, "registers", None)
         if isinstance(registers, RegisterMap):
-            cut = _held(self.limits, registers.u)
+            cut = _limits_in_register(self.limits, registers.u)
             step = registers.u.step
             is_multiple = step and math.isclose(registers.u.offset / step, round(registers.u.offset / step))
             signals = self.signals
@@ -106,7 +106,7 @@ class Config(Section):
         return self
 
 
-def _held(limits: LimitSettings, register: RegisterSettings) -> LimitSettings:
+def _limits_in_register(limits: LimitSettings, register: RegisterSettings) -> LimitSettings:
     try:
         u_min, u_max = register.inwards(limits.u_min, limits.u_max)
     except ValueError as error:
@@ -134,7 +134,7 @@ def load_config(path: str | os.PathLike[str]) -> Config:
     InputError
         No such file, not TOML, or the first key that was refused: its path, the allowed range, the nearest known key.
     """
-    return validated(Config, read_toml(path), str(path))
+    return validate(Config, read_toml(path), str(path))
 
 
 def json_schema() -> dict[str, Any]:

@@ -162,9 +162,7 @@ def controller_gain(loop: OpenLoop, start_rad_s: float) -> float:
     return largest
 
 
-def refined_minimum(
-    f: Callable[[FloatArray], FloatArray], omega: FloatArray, values: FloatArray
-) -> tuple[float, float]:
+def refine_minimum(f: Callable[[FloatArray], FloatArray], omega: FloatArray, values: FloatArray) -> tuple[float, float]:
     """Return the minimum of f and where it is, given its values on a grid that resolves it.
 
     Of the local minima on the grid those within a tenth of the lowest, eight at most, are searched between their
@@ -217,7 +215,7 @@ def modulus_margin(loop: OpenLoop, omega: FloatArray, L: ComplexArray) -> tuple[
     tuple of float
         M_m, and its frequency [rad/s]; infinite where only ever higher frequencies come near it.
     """
-    lowest, at = refined_minimum(lambda x: np.abs(1.0 + loop.response(x)), omega, np.abs(1.0 + L))
+    lowest, at = refine_minimum(lambda x: np.abs(1.0 + loop.response(x)), omega, np.abs(1.0 + L))
     if isinstance(loop, ContinuousLoop) and loop.transfer_function.delay_s > 0.0 and loop.gain_at_infinity > 0.0:
         # dead time turns a gain that does not vanish through -180 deg for ever
         limit = abs(1.0 - loop.gain_at_infinity)
@@ -301,5 +299,5 @@ def noise_amplification(loop: OpenLoop, omega: FloatArray, start: float) -> floa
         return -np.abs(loop.controller_response(x) / (1.0 + loop.response(x)))
 
     above = np.concatenate(([start], omega[omega > start]))
-    lowest, _ = refined_minimum(f, above, f(above))
+    lowest, _ = refine_minimum(f, above, f(above))
     return -lowest

@@ -15,7 +15,7 @@ from autotune.arrays import ComplexArray, FloatArray
 from autotune.controller import Controller
 from autotune.design.axis import characteristic_frequencies, turn_along_axis
 from autotune.design.loop import ContinuousLoop, Plant, SampledLoop, open_loop, transfer_function_of
-from autotune.design.margins import refined_minimum
+from autotune.design.margins import refine_minimum
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
 
@@ -72,7 +72,7 @@ def nu_gap(P1: Plant, P2: Plant, *, scaling: float = 1.0) -> float:
     def f(x: FloatArray) -> FloatArray:
         return -chordal_distance(scaling * H1.response(x), scaling * H2.response(x))
 
-    return -refined_minimum(f, omega, f(omega))[0]
+    return -refine_minimum(f, omega, f(omega))[0]
 
 
 def generalized_stability_margin(plant: Plant, controller: Controller, *, scaling: float = 1.0) -> float:
@@ -100,7 +100,7 @@ def generalized_stability_margin(plant: Plant, controller: Controller, *, scalin
     def f(x: FloatArray) -> FloatArray:
         return _local_margin(loop, x, scaling)
 
-    return refined_minimum(f, omega, f(omega))[0]
+    return refine_minimum(f, omega, f(omega))[0]
 
 
 def _local_margin(loop: ContinuousLoop | SampledLoop, omega: FloatArray, scaling: float) -> FloatArray:

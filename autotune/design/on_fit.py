@@ -110,14 +110,14 @@ def design_on_plants(
     for _ in range(ROUNDS):
         found = design(nominal, specification, kind, also=members.chosen(chosen).plants, certificate=False)
         slack = members.slacks(found.controller, specification)
-        worst = missed(slack)
+        worst = most_missed(slack)
         if worst <= set(chosen):
             break
         chosen += sorted(worst - set(chosen))
     return found, slack
 
 
-def missed(slack: FloatArray) -> set[int]:
+def most_missed(slack: FloatArray) -> set[int]:
     """Return which plants miss a margin most, given their (S, 3) slacks: what a next round must keep as well."""
     return {int(i) for i in np.argmin(slack, axis=0) if np.min(slack[i]) < -TOLERANCE}
 

@@ -12,7 +12,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
 from autotune.design.corners import plainest
-from autotune.design.search import Problem, polished
+from autotune.design.search import Problem, polish
 from autotune.design.search_starts import admissible, separate
 from autotune.errors import DesignError
 
@@ -48,7 +48,7 @@ def best_pid(problem: Problem, pi: PIDController | None, largest: float, omega_r
     if not len(nodes):
         return pi
     try:
-        best = polished(problem, nodes)
+        best = polish(problem, nodes)
     except DesignError:  # no PID was found between the frequencies of the grid: the PI is one with T_d = 0
         return pi
     both = [np.array((abs(c.K), c.Ti_s, c.Td_s, c.Tf_s)) for c in (pi, best) if c is not None]

@@ -22,11 +22,11 @@ from autotune.design.kernels import evaluate, evaluate_grid
 from autotune.design.load_error import least_error, load_step
 from autotune.design.margins import Margins
 from autotune.design.members import members_of
-from autotune.design.on_fit import ROUNDS, missed
+from autotune.design.on_fit import ROUNDS, most_missed
 from autotune.design.on_structures import design_on_structures, require_kept
-from autotune.design.search import minimised
+from autotune.design.search import minimise
 from autotune.design.specification import UNCERTAIN, Design, Kind, Specification
-from autotune.design.uncertain import UncertainPlant, guaranteed, uncertain_plant
+from autotune.design.uncertain import UncertainPlant, guaranteed_figures, uncertain_plant
 from autotune.errors import DesignError
 from autotune.identification.consistent_structures import consistent_structures
 from autotune.points import FrequencyPoint
@@ -98,7 +98,7 @@ def design_on_points(
         if not members.plants:
             return found
         slack = members.slacks(found.controller, specification)
-        worst = missed(slack) - set(chosen)
+        worst = most_missed(slack) - set(chosen)
         if not worst:
             break
         chosen += sorted(worst)
@@ -108,7 +108,7 @@ def design_on_points(
 
 def _slacks(plant: UncertainPlant, specification: Specification, p: FloatArray) -> FloatArray:
     """Return (4,) relative slacks that every plant of the set has, and the margins that its members have."""
-    figures, _ = guaranteed(plant.omega, plant.supports, p[0], p[1], p[2], p[3], _omega_n(specification))
+    figures, _ = guaranteed_figures(plant.omega, plant.supports, p[0], p[1], p[2], p[3], _omega_n(specification))
     slacks = np.minimum(specification.slacks(figures), 10.0)
     for s in plant.members:
         other = evaluate(s.omega, s.h, s.weights, s.turn, p[0], p[1], p[2], p[3], -1.0)
@@ -202,7 +202,10 @@ def _raise_least_slack(plant: UncertainPlant, specification: Specification, node
 
         simplex = 0.3 * (np.vstack((np.zeros(size), np.eye(size))) - 0.5 / size)
         result = minimize(
-            missed, np.zeros(size), method="Nelder-Mead", options={"initial_simplex": simplex, "maxfev": 120 * size}
+            missed,
+            np.zeros(size),
+            method="Nelder-Mead",
+            options={"initial_simplex": simplex, "maxfev": 120 * size},
         )
         if result.fun <= 0.0:
             reached = node.copy()
@@ -274,7 +277,7 @@ def _quadratic(
 
     x = np.zeros(int(np.sum(free)))
     for span in spans:
-        minimised(look, x, span, most=40, tolerance=1e-10)
+        minimise(look, x, span, most=40, tolerance=1e-10)
         if best[0] < math.inf:
             x = np.log(best[1][free] / start[free])
     return best[1]
@@ -318,12 +321,12 @@ def _coarse_grid(plant: UncertainPlant, specification: Specification, kind: Kind
 def _answer(
     plant: UncertainPlant, specification: Specification, kind: Kind, p: FloatArray, probability: float
 ) -> Design:
-    from autotune.design.synthesis import weighted
+    from autotune.design.synthesis import weight_set_point
 
     n = plant.nominal
     K, Ti, Td, Tf = (float(value) for value in p)
     controller = PIDController(K=n.sign * K, Ti_s=Ti, Td_s=Td, Tf_s=Tf)
-    kept, gain = guaranteed(plant.omega, plant.supports, K, Ti, Td, Tf, _omega_n(specification))
+    kept, gain = guaranteed_figures(plant.omega, plant.supports, K, Ti, Td, Tf, _omega_n(specification))
     modulus = float(kept.modulus)
     L = n.h * controller.response(n.omega) * n.sign
     crossing = int(np.flatnonzero(np.abs(L) >= 1.0)[-1])
@@ -348,7 +351,7 @@ def _answer(
     inverse = ", with or without inverse response," if plant.processes.inverse_s.size else ""
     return Design(
         kind=kind,
-        controller=weighted(controller, specification),
+        controller=weight_set_point(controller, specification),
         specification=specification,
         h2=m.h2,
         h2_lower_bound=None,

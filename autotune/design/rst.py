@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from autotune.arguments import checked
+from autotune.arguments import check_arguments
 from autotune.arrays import FloatArray
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
@@ -47,7 +47,7 @@ class RST:
         """Return F = T/R of figure 1, so that u = C (F r - y)."""
         return TransferFunction(num=self.T, den=self.R)
 
-    @checked
+    @check_arguments
     def law(self, sample_time_s: float, *, u_min: float = -math.inf, u_max: float = math.inf) -> RSTLaw:
         """Return the controller as it runs: difference equations between limits of the command.
 

@@ -145,7 +145,7 @@ def _exact_figures(
     )
 
 
-def polished(problem: Problem, starts: FloatArray) -> PIDController:
+def polish(problem: Problem, starts: FloatArray) -> PIDController:
     """Return the best controller reached from the starting values, its constraints corrected to the exact ones.
 
     Parameters with value 0 stay 0. Where the corrections do not settle on the feasible side, a little more is asked
@@ -238,12 +238,12 @@ def _local_search(problem: Problem, start: FloatArray, offset: FloatArray) -> tu
 
     x = np.zeros(int(np.sum(free)))
     for span in (1.0, 0.05):
-        ended = minimised(look, x, span, most=60, tolerance=1e-12)
+        ended = minimise(look, x, span, most=60, tolerance=1e-12)
         x = np.log(best[1][free] / start[free]) if best[0] < math.inf else ended
     return math.sqrt(best[0]), best[1]
 
 
-def minimised(
+def minimise(
     look: Callable[[FloatArray], tuple[float, FloatArray]],
     start: FloatArray,
     span: float,

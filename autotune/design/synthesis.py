@@ -18,7 +18,7 @@ from autotune.design.kernels import SampledPlant, sampled_plant
 from autotune.design.load_error import least_error, load_step
 from autotune.design.loop import Plant, transfer_function_of
 from autotune.design.margins import margins
-from autotune.design.search import Problem, polished
+from autotune.design.search import Problem, polish
 from autotune.design.search_starts import admissible, separate
 from autotune.design.specification import Design, Kind, Specification
 from autotune.errors import DesignError
@@ -114,7 +114,7 @@ def design(
         bound, statement = lower_bound(H, problem.sampled[0], specification, controller, found[0])
     return Design(
         kind=kind,
-        controller=weighted(controller, specification),
+        controller=weight_set_point(controller, specification),
         specification=specification,
         h2=found[0].h2,
         h2_lower_bound=bound,
@@ -162,7 +162,7 @@ def _least_error(problem: Problem, controller: PIDController) -> PIDController:
     return controller
 
 
-def weighted(controller: PIDController, specification: Specification) -> PIDController:
+def weight_set_point(controller: PIDController, specification: Specification) -> PIDController:
     """Return the controller with the largest set-point weight that keeps the immediate set-point command.
 
     Parameters
@@ -207,11 +207,11 @@ def _best_pi(problem: Problem) -> PIDController:
     least = np.min(slack, axis=1)
     feasible = least >= -1e-12
     if np.any(feasible):
-        return polished(problem, separate(grid[feasible][np.argsort(norms[feasible])], 0.8, _STARTS))
+        return polish(problem, separate(grid[feasible][np.argsort(norms[feasible])], 0.8, _STARTS))
     starts = admissible(problem, separate(grid[np.argsort(-least)], 0.4, _LED))
     if not len(starts):
         raise _unreachable(problem.specification, slack)
-    return polished(problem, starts)
+    return polish(problem, starts)
 
 
 def _best_pid(problem: Problem) -> PIDController:

@@ -157,7 +157,7 @@ def _nearest_to_critical(a: FloatArray, b: FloatArray, h: FloatArray) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def guaranteed(
+def guaranteed_figures(
     omega: FloatArray, supports: FloatArray, K: float, Ti: float, Td: float, Tf: float, omega_n: float
 ) -> tuple[Figures, float]:
     """Return the figures that every plant of the set keeps (no norm among them), and its gain margin.

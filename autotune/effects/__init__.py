@@ -57,12 +57,12 @@ def counted_as(name: str) -> frozenset[str]:
     return frozenset((name, *KINDS[name].same, *KINDS[name].like, *larger))
 
 
-def called(name: str) -> str:
+def shared_name(name: str) -> str:
     """Return the one name of all effects that command and reading cannot tell from one another."""
     return min((name, *KINDS[name].same, *KINDS[name].like))
 
 
-def taken_by(names: Iterable[str]) -> set[str]:
+def related_effects(names: Iterable[str]) -> set[str]:
     """Return the effects that are not added beside others: these, what they include, and what includes them."""
     given = set(names)
     inner = {other for name in given for other in KINDS[name].includes}

@@ -33,7 +33,7 @@ def require_complete(kinds: Sequence[EffectKind]) -> None:
     """
     names = [kind.name for kind in kinds]
     for kind in kinds:
-        for what, remedy in (*_of(kind), *_related(kind, names)):
+        for what, remedy in (*_of(kind), *_relation_problems(kind, names)):
             raise InputError(what, where=f"effect {kind.name}", remedy=remedy)
 
 
@@ -65,7 +65,7 @@ def _of(kind: EffectKind) -> Iterator[tuple[str, str]]:
         if rig not in (*get_args(RigKind), "any"):
             yield f"odds of no kind of rig: {rig!r}", f"kinds are {', '.join(get_args(RigKind))}, any"
     if kind.is_simulated:
-        yield from _simulated(kind)
+        yield from _simulation_problems(kind)
     yield from _starts(kind)
 
 
@@ -104,7 +104,7 @@ def _has_starts(kind: EffectKind) -> bool:
     return kind.search is not None or kind.starts.__name__ != "no_starts"
 
 
-def _simulated(kind: EffectKind) -> Iterator[tuple[str, str]]:
+def _simulation_problems(kind: EffectKind) -> Iterator[tuple[str, str]]:
     used = set()
     for line in kind.lines:
         yield from _line(kind, line)
@@ -149,7 +149,7 @@ def _line(kind: EffectKind, line: Line) -> Iterator[tuple[str, str]]:
             yield f"its line does not take {name!r}", f"stage {line.stage} passes {', '.join(stage.value)} through"
 
 
-def _related(kind: EffectKind, names: Sequence[str]) -> Iterator[tuple[str, str]]:
+def _relation_problems(kind: EffectKind, names: Sequence[str]) -> Iterator[tuple[str, str]]:
     if names.count(kind.name) > 1:
         yield "stands twice in the catalogue", "give one of them another name"
     for key in ("same", "like", "excludes", "includes"):

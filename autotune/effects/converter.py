@@ -55,13 +55,13 @@ def converter_steps(scan: Scan) -> list[tuple[float, ...]]:
 
     found = followed(_lines(scan, middle))
     for origin in {0.0, scan.operating_command}:
-        turns = [(step, (origin - middle) / step) for step in _counted(scan, origin)]
+        turns = [(step, (origin - middle) / step) for step in _steps_from_origin(scan, origin)]
         found += followed([(step, phase - round(phase)) for step, phase in turns])
     decrease, values = max(found, default=(0.0, ()))
     return [values] if decrease > 0.0 else []
 
 
-def _counted(scan: Scan, origin: float) -> list[float]:
+def _steps_from_origin(scan: Scan, origin: float) -> list[float]:
     """Return the steps that predict most where they are counted from a known origin.
 
     A command that takes few values is rounded the other way at certain steps only: they are tried more closely. Where

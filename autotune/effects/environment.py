@@ -205,7 +205,7 @@ def _without_lag(values: Values) -> tuple[str, dict[str, float]] | None:
     return ("environment.measured_input", at_once) if len(at_once) < len(values) else None
 
 
-def _measured_tried(a: Around) -> list[Tried]:
+def _column_trials(a: Around) -> list[Tried]:
     """Return recorded columns as they are and from their mean on, at once and with a lag."""
     lags = [a.dt_s * float(np.exp(share * np.log(a.slow_s / a.dt_s))) for share in _LAGS]
     found = []
@@ -337,7 +337,7 @@ ENVIRONMENT = (
             memory=(("memory", "(column - memory)/time_constant"),),
             at_once="gain*(column - reference)",
             unless="time_constant",
-            trials=_measured_tried,
+            trials=_column_trials,
             spread={"reference": lambda s: s.column},
             plainer=_without_lag,
         ),

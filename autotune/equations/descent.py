@@ -27,7 +27,7 @@ from autotune.equations.sensitivity import (
     side_by_side,
 )
 from autotune.equations.simulate import Compiled, Drive, Run
-from autotune.equations.starts import given_starts, started_anew, state_scales
+from autotune.equations.starts import restart_some, state_scales, stated_starts
 from autotune.errors import InputError
 
 #: Relative decrease of the penalised sum of squares below which a fit has converged.
@@ -67,13 +67,13 @@ class Descent:
     ) -> None:  # fmt: skip
         self._compiled, self._data, self._which, self._z = compiled, list(data), which, z
         self._known = known  # derivatives at every row of every recording where the descent begins
-        self._free_first = np.flatnonzero(~np.isfinite(given_starts(compiled)))
+        self._free_first = np.flatnonzero(~np.isfinite(stated_starts(compiled)))
         start = values_of(compiled, z)
         scales = [state_scales(compiled, start, one.drive, one.windows.states[0]) for one in data]
         self._scales = np.max(scales, axis=0)
         self._damping, self._firmness = 1e-3, FIRMNESS
         self._last: FloatArray | None = None
-        errors = self._simulated(z, [one.windows for one in data])
+        errors = self._errors_of(z, [one.windows for one in data])
         if errors is None:
             raise InputError(
                 "the simulation runs away from every start", where=compiled.model.name,
@@ -82,7 +82,7 @@ class Descent:
         self._errors = errors
         self._sd = self._noise(errors)
 
-    def _simulated(self, z: FloatArray, windows: Sequence[Windows]) -> list[FloatArray] | None:
+    def _errors_of(self, z: FloatArray, windows: Sequence[Windows]) -> list[FloatArray] | None:
         """Return reading less simulation at the rows that count, None where a run does not reach its end."""
         found, p = [], values_of(self._compiled, z)
         each = list(zip(self._data, windows, strict=True))
@@ -210,8 +210,8 @@ class Descent:
         new_z = at.z.copy()
         new_z[self._which] += np.clip(move, -3.0, 3.0)
         each = zip(at.windows, backs, at.errors, strict=True)
-        windows = [self._moved(w, back, error, new_z[self._which] - z) for w, back, error in each]
-        errors = self._simulated(new_z, windows)
+        windows = [self._move_starts(w, back, error, new_z[self._which] - z) for w, back, error in each]
+        errors = self._errors_of(new_z, windows)
         return None if errors is None else _Iterate(z=new_z, windows=windows, errors=errors)
 
     def _cost(self) -> float:
@@ -221,7 +221,7 @@ class Descent:
         e = np.concatenate(list(errors)) / self._sd
         return float(e @ e + z[self._which] @ z[self._which])
 
-    def _moved(self, windows: Windows, back: _Back, error: FloatArray, move: FloatArray) -> Windows:
+    def _move_starts(self, windows: Windows, back: _Back, error: FloatArray, move: FloatArray) -> Windows:
         """Return windows whose start states take up what the parameters' move leaves."""
         states, at = windows.states.copy(), 0
         for k, (X, free, J, _) in enumerate(back):
@@ -232,7 +232,7 @@ class Descent:
             states[k, free] += self._scales[free] * np.linalg.solve(H, X.T @ wanted)
         return replace(windows, states=states)
 
-    def restarted(self) -> bool:
+    def restart_windows(self) -> bool:
         """Start windows that stand out anew, from where the one before ends; return whether that explains any better.
 
         A start state that made up for wrong numbers may lead to another swing than the right one, for good.
@@ -243,7 +243,7 @@ class Descent:
             return False
         most = STANDS_OUT * float(np.median(known))
         windows = [
-            started_anew(
+            restart_some(
                 self._compiled, p, one.drive, one.y, one.good, one.windows, np.flatnonzero(size > most), self._scales
             )
             for one, size in zip(self._data, before, strict=True)
@@ -254,7 +254,7 @@ class Descent:
             states = np.where(better[:, None], new.states, one.windows.states)
             self._data[i] = replace(one, windows=replace(one.windows, states=states))
             found = found or bool(better.any())
-        errors = self._simulated(self._z, [one.windows for one in self._data]) if found else None
+        errors = self._errors_of(self._z, [one.windows for one in self._data]) if found else None
         self._errors = self._errors if errors is None else errors
         return found
 

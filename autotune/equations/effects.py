@@ -17,9 +17,9 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.effects import KINDS
 from autotune.effects.in_equations import InEquations
-from autotune.equations.expressions import Call, Expression, Name, parse, substituted, to_text
+from autotune.equations.expressions import Call, Expression, Name, parse, substitute, to_text
 from autotune.equations.model import EquationModel, Extension, ModelParameter, State
-from autotune.equations.samples import OPERATIONS, quantised
+from autotune.equations.samples import OPERATIONS, quantise
 from autotune.equations.shared_forces import joint_at
 from autotune.equations.simulate import Compiled, Drive, Held, compile_model
 from autotune.errors import InputError
@@ -109,7 +109,7 @@ def apply(model: EquationModel, effects: Sequence[Effect] | None = None) -> Appl
 
     def on_reading(y: FloatArray) -> FloatArray:
         for step in steps:
-            y = quantised(y, step)
+            y = quantise(y, step)
         return y
 
     return Applied(extensions=tuple(extensions), delays=delays, before=on_drive, after=on_reading)
@@ -189,7 +189,7 @@ def _extension_of(model: EquationModel, effect: Effect, number: int = 0) -> Exte
             )
             return Name(prefix + name)
 
-        return substituted(parse(text, effect.name), replaced)
+        return substitute(parse(text, effect.name), replaced)
 
     tree = bound(text)
     memory = form.memory if form.remembers(effect.parameters) else ()
@@ -355,7 +355,7 @@ def position_under(model: EquationModel, across: Expression) -> Expression | Non
             lost.append(name)
         return None
 
-    tree = substituted(across, position)
+    tree = substitute(across, position)
     return None if lost or tree == across else tree
 
 
@@ -418,12 +418,12 @@ def equation_of(model: EquationModel, effect: Effect) -> str:
         return f"{column}(t - {_key(effect)})"
     if not form.text:
         return ""
-    tree = substituted(parse(text_of(form, effect)), local_names(model, effect).get)
+    tree = substitute(parse(text_of(form, effect)), local_names(model, effect).get)
     if form.acts == "anywhere" and not (effect.state or effect.port):
         return f"{effect.input or 'y'} -> {effect.input or 'y'} + {to_text(tree)}"
     if form.acts in ("input", "reading"):
         signal = column if form.acts == "input" else "y"
-        return f"{signal} -> {to_text(substituted(tree, lambda name: Name(signal) if name == 'value' else None))}"
+        return f"{signal} -> {to_text(substitute(tree, lambda name: Name(signal) if name == 'value' else None))}"
     if effect.port:
         return f"{effect.port} = {to_text(tree)}"
     shares = joint_at(model, effect.state).shares.items()

@@ -10,13 +10,13 @@ import re
 from collections.abc import Mapping
 
 from autotune.equations.expressions import Call, Expression, Name, Number, to_text
-from autotune.equations.flatten import flattened
+from autotune.equations.flatten import flatten
 from autotune.equations.model import EquationModel
 
 
 def as_text(model: EquationModel) -> str:
     """Return the equations as a person writes them on paper, with their numbers below."""
-    flat = flattened(model)
+    flat = flatten(model)
     lines = [flat.name, ""]
     lines += [f"{name} = {to_text(tree)}" for name, tree in flat.defines]
     lines += [f"d{one.name}/dt = {to_text(one.derivative)}{_unit(one.unit)}" for one in flat.states]
@@ -38,7 +38,7 @@ def as_modelica(model: EquationModel) -> str:
 
     Switched terms stay as they are written: Modelica locates their events itself. Dead times become ``delay(u, d)``.
     """
-    flat = flattened(model)
+    flat = flatten(model)
     names = _safe_names(flat, _MODELICA_WORDS)
     arrives = {one.column: f"{names[one.column]}_late" if one.delay_s else names[one.column] for one in flat.inputs}
     said = names | arrives
@@ -114,7 +114,7 @@ def as_python(model: EquationModel) -> str:
     It needs the standard library alone. ``x`` is a sequence in the order of ``STATES``, ``inputs`` in the order of
     ``INPUTS`` (those of ``DELAYS`` that many seconds ago), ``p`` a mapping, by default ``PARAMETERS``.
     """
-    flat = flattened(model)
+    flat = flatten(model)
     names = _safe_names(flat, _PYTHON_WORDS)
     unpack = [f"    {', '.join(names[s] for s in flat.state_names)}, = x"]
     unpack += [f"    {', '.join(names[c] for c in flat.columns)}, = inputs"]

@@ -112,12 +112,12 @@ class _Parser:
             found = _TOKEN.match(self._text, at)
             if not found:
                 at += len(self._text[at:]) - len(self._text[at:].lstrip())
-                raise self._refused(f"{self._text[at]!r} has no meaning here", at)
+                raise self._refusal(f"{self._text[at]!r} has no meaning here", at)
             kind = str(found.lastgroup)
             yield kind, found[kind], found.start(kind)
             at = found.end()
 
-    def _refused(self, what: str, at: int | None = None) -> InputError:
+    def _refusal(self, what: str, at: int | None = None) -> InputError:
         if at is None:
             at = self._tokens[self._at][2] if self._at < len(self._tokens) else len(self._text)
         shown = self._text if len(self._text) <= 80 else f"{self._text[:77]}..."
@@ -138,25 +138,25 @@ class _Parser:
 
     def _close(self) -> None:
         if self._take(")") is None:
-            raise self._refused(f"')' is missing before {self._peek()!r}" if self._peek() else "')' is missing")
+            raise self._refusal(f"')' is missing before {self._peek()!r}" if self._peek() else "')' is missing")
 
     def whole(self) -> Expression:
         if not self._tokens:
-            raise self._refused("nothing is written", 0)
+            raise self._refusal("nothing is written", 0)
         tree = self._sum()
         if self._at < len(self._tokens):
             sign = self._peek()
             if sign == "**":
-                raise self._refused("powers are written with ^, not **")
+                raise self._refusal("powers are written with ^, not **")
             if sign in (*_COMPARISONS, "==", "!="):
-                raise self._refused(f"the comparison {sign!r} stands only in if(condition, a, b)")
-            raise self._refused(f"{sign!r} is one too many")
+                raise self._refusal(f"the comparison {sign!r} stands only in if(condition, a, b)")
+            raise self._refusal(f"{sign!r} is one too many")
         return tree
 
     def _sum(self) -> Expression:
         self._depth += 1
         if self._depth > DEEPEST:
-            raise self._refused("nested too deep")
+            raise self._refusal("nested too deep")
         tree = self._product()
         while (sign := self._take("+", "-")) is not None:
             tree = Call(sign, (tree, self._product()))
@@ -168,7 +168,7 @@ class _Parser:
         while (sign := self._take("*", "/")) is not None:
             divisor_at, right = self._at, self._read_signed()
             if sign == "/" and right == Number(0.0):
-                raise self._refused("division by zero", self._tokens[divisor_at][2])
+                raise self._refusal("division by zero", self._tokens[divisor_at][2])
             tree = Call(sign, (tree, right))
         return tree
 
@@ -177,7 +177,7 @@ class _Parser:
         while (sign := self._take("+", "-")) is not None:
             minus, count = minus ^ (sign == "-"), count + 1
             if count > DEEPEST:
-                raise self._refused("nested too deep")
+                raise self._refusal("nested too deep")
         tree = self._power()
         return Call("neg", (tree,)) if minus else tree
 
@@ -187,19 +187,19 @@ class _Parser:
             return base
         self._depth += 1
         if self._depth > DEEPEST:
-            raise self._refused("nested too deep")
+            raise self._refusal("nested too deep")
         exponent = self._read_signed()
         self._depth -= 1
         return Call("^", (base, exponent))
 
     def _atom(self) -> Expression:
         if self._at >= len(self._tokens):
-            raise self._refused("something is missing at the end")
+            raise self._refusal("something is missing at the end")
         kind, text, at = self._tokens[self._at]
         self._at += 1
         if kind == "number":
             if not math.isfinite(float(text)):
-                raise self._refused("no number holds this", at)
+                raise self._refusal("no number holds this", at)
             return Number(float(text))
         if kind == "name":
             return self._read_call(text, at) if self._take("(") is not None else self._read_name(text, at)
@@ -208,18 +208,18 @@ class _Parser:
             self._close()
             return tree
         self._at -= 1
-        raise self._refused("powers are written with ^, not **" if text == "**" else f"{text!r} has nothing before it")
+        raise self._refusal("powers are written with ^, not **" if text == "**" else f"{text!r} has nothing before it")
 
     def _read_name(self, name: str, at: int) -> Expression:
         if name in FUNCTIONS:
-            raise self._refused(f"{name} is a function: {name}(...)", at)
+            raise self._refusal(f"{name} is a function: {name}(...)", at)
         return Name(name)
 
     def _read_call(self, name: str, at: int) -> Expression:
         if name not in FUNCTIONS:
             near = get_close_matches(name, FUNCTIONS, 1)
             hint = f", did you mean {near[0]}?" if near else ""
-            raise self._refused(f"unknown function {name!r}{hint}", at)
+            raise self._refusal(f"unknown function {name!r}{hint}", at)
         arguments = [self._condition() if name == "if" else self._sum()]
         while self._take(",") is not None:
             arguments.append(self._sum())
@@ -227,14 +227,14 @@ class _Parser:
         wanted = FUNCTIONS[name]
         more = name in ("min", "max") and len(arguments) > wanted
         if len(arguments) != wanted and not more:
-            raise self._refused(f"{name} takes {wanted} argument(s), not {len(arguments)}", at)
+            raise self._refusal(f"{name} takes {wanted} argument(s), not {len(arguments)}", at)
         return Call(name, tuple(arguments))
 
     def _condition(self) -> Expression:
         left = self._sum()
         sign = self._take(*_COMPARISONS)
         if sign is None:
-            raise self._refused("if needs a comparison with < <= > or >= first: if(a > b, then, else)")
+            raise self._refusal("if needs a comparison with < <= > or >= first: if(a > b, then, else)")
         return Call(sign, (left, self._sum()))
 
 
@@ -248,7 +248,7 @@ def names_in(tree: Expression) -> set[str]:
     return set()
 
 
-def substituted(tree: Expression, replace: Callable[[str], Expression | None]) -> Expression:
+def substitute(tree: Expression, replace: Callable[[str], Expression | None]) -> Expression:
     """Return an expression with names replaced by expressions.
 
     Parameters
@@ -263,7 +263,7 @@ def substituted(tree: Expression, replace: Callable[[str], Expression | None]) -
             new = replace(name)
             return tree if new is None else new
         case Call(function, arguments):
-            return Call(function, tuple(substituted(one, replace) for one in arguments))
+            return Call(function, tuple(substitute(one, replace) for one in arguments))
     return tree
 
 

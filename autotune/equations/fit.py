@@ -80,7 +80,7 @@ def fit(
     state = Descent(compiled, data, which, z)
     for k in range(iterations):
         rests = state.step()
-        if (rests or k % 2) and k + 1 < iterations and state.restarted():
+        if (rests or k % 2) and k + 1 < iterations and state.restart_windows():
             continue
         if rests:
             break

@@ -9,7 +9,7 @@ import numpy as np
 from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.equations.sensitivity import Windows
 from autotune.equations.simulate import Compiled, Drive, drive_of
-from autotune.equations.starts import fitted_starts
+from autotune.equations.starts import fit_starts
 from autotune.errors import InputError
 from autotune.recording import Recording
 
@@ -124,5 +124,5 @@ def data_of(
         starts, stops = window_rows(recording.t, length_s)
         read = np.add.reduceat(good, starts) > 0  # a window without a reading tells nothing
         starts, stops = starts[read], stops[read]
-        windows = fitted_starts(compiled, parameters, drive, recording.y, good, starts, stops, known=known)
+        windows = fit_starts(compiled, parameters, drive, recording.y, good, starts, stops, known=known)
     return FitData(drive=drive, y=recording.y, good=good, windows=windows)

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from autotune.equations.effects import apply, form_of
-from autotune.equations.expressions import Call, Expression, Name, Number, substituted
+from autotune.equations.expressions import Call, Expression, Name, Number, substitute
 from autotune.equations.model import EquationModel
 from autotune.errors import InputError
 
 
-def flattened(model: EquationModel) -> EquationModel:
+def flatten(model: EquationModel) -> EquationModel:
     """Return a model whose effects, offsets and ports have become part of its equations.
 
     Parameters
@@ -50,21 +50,21 @@ def flattened(model: EquationModel) -> EquationModel:
         before = now[next(iter(extension.input))] if extension.input else output
         value = _replacing({"value": before})
         for state in extension.states:
-            memories[state.name] = substituted(state.derivative, value)
+            memories[state.name] = substitute(state.derivative, value)
             states.append(state)
         parameters += extension.parameters
         for column, tree in extension.input.items():
-            now[column] = substituted(tree, value)
+            now[column] = substitute(tree, value)
         if extension.output is not None:
-            output = substituted(extension.output, value)
+            output = substitute(extension.output, value)
         for port, tree in extension.port.items():
             ports[port] = tree if ports[port] == Number(0.0) else Call("+", (ports[port], tree))
         for name, tree in extension.derivative.items():
             slopes[name] = Call("+", (slopes[name], tree))
     # a memory's own value is the column as it comes; everything else sees what arrives
     at_ports, arrives = _replacing(ports), _replacing(now)
-    slopes = {name: substituted(substituted(tree, at_ports), arrives) for name, tree in slopes.items()}
-    slopes |= {name: substituted(tree, at_ports) for name, tree in memories.items()}
+    slopes = {name: substitute(substitute(tree, at_ports), arrives) for name, tree in slopes.items()}
+    slopes |= {name: substitute(tree, at_ports) for name, tree in memories.items()}
     return replace(
         model,
         inputs=tuple(
@@ -73,8 +73,8 @@ def flattened(model: EquationModel) -> EquationModel:
         ),
         states=tuple(replace(state, derivative=slopes[state.name]) for state in states),
         parameters=tuple(parameters),
-        defines=tuple((name, substituted(substituted(tree, at_ports), arrives)) for name, tree in defines),
-        output=substituted(output, arrives),
+        defines=tuple((name, substitute(substitute(tree, at_ports), arrives)) for name, tree in defines),
+        output=substitute(output, arrives),
         ports=(),
         effects=(),
     )

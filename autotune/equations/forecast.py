@@ -11,7 +11,7 @@ from autotune.equations.effects import apply
 from autotune.equations.model import EquationModel
 from autotune.equations.sensitivity import Windows, run_windows
 from autotune.equations.simulate import Compiled, Drive, compile_model, drive_of, require_complete, simulate
-from autotune.equations.starts import LEAST, fitted_starts
+from autotune.equations.starts import LEAST, fit_starts
 from autotune.errors import InputError
 from autotune.recording import Recording
 
@@ -66,7 +66,7 @@ def _add_delays(compiled: Compiled, delays: FloatArray) -> Compiled:
 def _free_run(compiled: Compiled, drive: Drive, recording: Recording) -> FloatArray:
     y, good = recording.y, np.isfinite(recording.y)
     first, last = np.zeros(1, dtype=np.int64), np.array([len(recording)])
-    windows = fitted_starts(compiled, compiled.parameter_vector, drive, y, good, first, last)
+    windows = fit_starts(compiled, compiled.parameter_vector, drive, y, good, first, last)
     run = simulate(compiled, compiled.parameter_vector, drive, windows.states)
     return require_complete(run, compiled, recording.name).y
 
@@ -90,7 +90,7 @@ def _forecast_windows(compiled: Compiled, drive: Drive, recording: Recording, ho
             start = max(min(int(np.searchsorted(t, t[a] - past * horizon_s)), a - LEAST), 0) if k else 0
             until = a if k else b
             guess = None if before is None else _carry_state(compiled, drive, before, start)
-            window = fitted_starts(
+            window = fit_starts(
                 compiled, p, drive, y, good, np.array([start]), np.array([until]), guess=guess, share=1.0, iterations=5
             )
             latest = replace(window, stops=np.array([b]))

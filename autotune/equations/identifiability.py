@@ -64,10 +64,12 @@ def combinations(fitted: Fitted, own: int | None = None) -> list[Combination]:
     parameters, J = fitted.compiled.parameters[:own], fitted.jacobian
     moved = [i for i, p in enumerate(parameters) if p.spread > 0.0]
     believed = np.asarray(np.linalg.inv(J.T @ J + np.eye(J.shape[1])), dtype=np.float64)[np.ix_(moved, moved)]
-    return determined(believed, np.array([parameters[i].spread for i in moved]), [parameters[i].name for i in moved])
+    return combinations_by_certainty(
+        believed, np.array([parameters[i].spread for i in moved]), [parameters[i].name for i in moved]
+    )
 
 
-def determined(believed: FloatArray, spread: FloatArray, names: Sequence[str]) -> list[Combination]:
+def combinations_by_certainty(believed: FloatArray, spread: FloatArray, names: Sequence[str]) -> list[Combination]:
     """Return the directions of parameters by how well data determine them, the least determined first.
 
     Parameters

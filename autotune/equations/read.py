@@ -273,7 +273,7 @@ def content_of(model: EquationModel, equations: Mapping[str, str] | None = None)
     if model.horizon_s is not None:
         content["horizon_s"] = model.horizon_s
     content["input"] = [_input_table(one) for one in model.inputs]
-    content["output"] = {"value": to_text(model.output)} | _given(unit=model.output_unit)
+    content["output"] = {"value": to_text(model.output)} | _drop_empty(unit=model.output_unit)
     if model.defines:
         content["define"] = {name: to_text(tree) for name, tree in model.defines}
     content["state"] = [_state_table(one) for one in model.states]
@@ -281,13 +281,13 @@ def content_of(model: EquationModel, equations: Mapping[str, str] | None = None)
         content["port"] = [
             {"name": one.name, "kind": one.kind}
             | ({} if one.across is None else {"across": to_text(one.across)})
-            | _given(unit=one.unit)
+            | _drop_empty(unit=one.unit)
             for one in model.ports
         ]
     if model.parameters:
         content["parameters"] = {
             one.name: {"value": one.value}
-            | _given(unit=one.unit)
+            | _drop_empty(unit=one.unit)
             | ({"fixed": True} if one.spread == 0.0 else {} if one.spread == SPREAD else {"spread": one.spread})
             for one in model.parameters
         }
@@ -296,18 +296,18 @@ def content_of(model: EquationModel, equations: Mapping[str, str] | None = None)
     return content
 
 
-def _given(**entries: Any) -> dict[str, Any]:
+def _drop_empty(**entries: Any) -> dict[str, Any]:
     return {key: value for key, value in entries.items() if value}
 
 
 def _input_table(one: InputColumn) -> dict[str, Any]:
     hold = "" if one.hold == "zero" else one.hold
-    return {"column": one.column} | _given(
+    return {"column": one.column} | _drop_empty(
         unit=one.unit, hold=hold, kind=one.kind, delay=one.delay_s, offset=one.offset
     )
 
 
 def _state_table(one: State) -> dict[str, Any]:
     kind = "" if one.kind == "other" else one.kind
-    table = {"name": one.name, "derivative": to_text(one.derivative)} | _given(unit=one.unit, kind=kind, of=one.of)
+    table = {"name": one.name, "derivative": to_text(one.derivative)} | _drop_empty(unit=one.unit, kind=kind, of=one.of)
     return table | ({} if one.start is None else {"start": one.start})

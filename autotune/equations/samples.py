@@ -64,7 +64,7 @@ def stiction(t: FloatArray, u: FloatArray, band: float) -> FloatArray:
 
 
 @njit(cache=True)
-def lagged(t: FloatArray, u: FloatArray, time_constant_s: float, straight: bool) -> FloatArray:
+def lag_signal(t: FloatArray, u: FloatArray, time_constant_s: float, straight: bool) -> FloatArray:
     """Return what follows u behind a lag, exact at the rows, at rest before the first one.
 
     Parameters
@@ -87,7 +87,7 @@ def lagged(t: FloatArray, u: FloatArray, time_constant_s: float, straight: bool)
     return w
 
 
-def quantised(values: FloatArray, step: float) -> FloatArray:
+def quantise(values: FloatArray, step: float) -> FloatArray:
     """Return values on a converter's steps; a step of 0 leaves them.
 
     Parameters
@@ -106,7 +106,7 @@ def quantised(values: FloatArray, step: float) -> FloatArray:
 
 
 def _converter(t: FloatArray, u: FloatArray, step: float) -> FloatArray:
-    return quantised(u, step)
+    return quantise(u, step)
 
 
 #: What may be done to the held samples of an input, by one number.

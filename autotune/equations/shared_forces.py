@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from autotune.equations.expressions import Call, Expression, Name, Number, names_in, substituted
+from autotune.equations.expressions import Call, Expression, Name, Number, names_in, substitute
 from autotune.equations.model import EquationModel
 
 
@@ -48,8 +48,8 @@ def joint_at(model: EquationModel, name: str) -> Joint:
         return alone
     defines: dict[str, Expression] = {}
     for key, tree in model.defines:
-        defines[key] = substituted(tree, defines.get)
-    slopes = {one.name: substituted(one.derivative, defines.get) for one in model.states}
+        defines[key] = substitute(tree, defines.get)
+    slopes = {one.name: substitute(one.derivative, defines.get) for one in model.states}
     for parameter, across in _products(slopes[name], frozenset(model.parameter_names)):
         speed, position = _across(model, across)
         if speed is None or position is None or _first(speed) != name:
@@ -119,9 +119,9 @@ def _across(model: EquationModel, tree: Expression) -> tuple[Expression | None, 
     parts = tree.arguments if isinstance(tree, Call) and tree.function == "-" else (tree,)
     names = [one.name for one in parts if isinstance(one, Name)]
     if len(names) == len(parts) and all(name in at for name in names):
-        return tree, substituted(tree, lambda name: Name(at[name]))
+        return tree, substitute(tree, lambda name: Name(at[name]))
     if len(names) == len(parts) and all(name in speeds for name in names):
-        return substituted(tree, lambda name: Name(speeds[name])), tree
+        return substitute(tree, lambda name: Name(speeds[name])), tree
     return None, None
 
 

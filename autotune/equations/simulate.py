@@ -12,7 +12,7 @@ from autotune.equations import kernel
 from autotune.equations.expressions import Call, Name
 from autotune.equations.model import EquationModel, Extension, ModelParameter
 from autotune.equations.native import Translator
-from autotune.equations.samples import lagged
+from autotune.equations.samples import lag_signal
 from autotune.equations.tape import Program, translate
 from autotune.errors import InputError
 from autotune.recording import Recording
@@ -281,7 +281,7 @@ def simulate(
         states = states.copy()
     for lag in compiled.lags:
         straight, constant = compiled.model.inputs[lag.column].hold == "linear", float(parameters[lag.parameter])
-        behind = lagged(drive.t, np.ascontiguousarray(drive.inputs[:, lag.column]), constant, straight)
+        behind = lag_signal(drive.t, np.ascontiguousarray(drive.inputs[:, lag.column]), constant, straight)
         states[:, lag.state] = np.interp(drive.t[first] - late[lag.column], drive.t, behind)
     outputs = np.full((program.outputs.size, rows), np.nan)
     ends, status = np.full(states.shape, np.nan), np.zeros((first.size, 3))

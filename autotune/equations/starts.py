@@ -21,7 +21,7 @@ HOPS, STRAYS = 8, 2.0
 ANEW, ANEW_STEPS = (0.1, 0.3, 1.0), 4
 
 
-def given_starts(compiled: Compiled) -> FloatArray:
+def stated_starts(compiled: Compiled) -> FloatArray:
     """Return the start value that the file states for each state, NaN where it is to be estimated, shape (n,)."""
     known = {one.name: one.start for one in compiled.model.states}
     values = [known.get(name) for name in compiled.states]
@@ -49,7 +49,7 @@ def rest_state(compiled: Compiled, parameters: FloatArray, inputs: FloatArray, y
     -----
     Least squares from a few starts; of several rests (a pendulum hangs or stands) the one nearest to zero is found.
     """
-    given = given_starts(compiled)
+    given = stated_starts(compiled)
     free = np.flatnonzero(~np.isfinite(given))
     base = np.where(np.isfinite(given), given, 0.0)
     if free.size == 0:
@@ -105,7 +105,7 @@ def state_scales(compiled: Compiled, parameters: FloatArray, drive: Drive, start
     return np.where(size > 1e-9, size, 1.0)
 
 
-def fitted_starts(
+def fit_starts(
     compiled: Compiled,
     parameters: FloatArray,
     drive: Drive,
@@ -140,14 +140,14 @@ def fitted_starts(
         Rows that it is fitted to at least.
     known : Windows, optional
         Where an earlier fit knows the state, on its own windows: a window that starts within one takes it over. Its
-        numbers are worth following, so that others begin where the readings lead, see :meth:`_Readings.followed`.
+        numbers are worth following, so that others begin where the readings lead, see :meth:`_Readings.follow_state`.
 
     Returns
     -------
     Windows
         With their states.
     """
-    given, first = given_starts(compiled), int(starts[0])
+    given, first = stated_starts(compiled), int(starts[0])
     reading = float(y[first:][good[first:]][0]) if good[first:].any() else float("nan")
     x = rest_state(compiled, parameters, drive.inputs[max(first - 1, 0)], reading) if guess is None else guess
     scales = state_scales(compiled, parameters, drive, x)
@@ -172,11 +172,11 @@ def fitted_starts(
             run = at.run(whole)
             x = run.ends[0] if np.all(np.isfinite(run.ends)) else x
             if known is not None and at.strays(run.y, whole):
-                x = at.followed(whole, iterations)
+                x = at.follow_state(whole, iterations)
     return Windows(starts=starts, stops=stops, states=np.array(found))
 
 
-def started_anew(
+def restart_some(
     compiled: Compiled, parameters: FloatArray, drive: Drive, y: FloatArray, good: BoolArray, windows: Windows,
     which: IntArray, scales: FloatArray,
 ) -> Windows:  # fmt: skip
@@ -195,7 +195,7 @@ def started_anew(
     scales : (n,) array
         How large each state typically is.
     """
-    w, states, given = windows, windows.states.copy(), given_starts(compiled)
+    w, states, given = windows, windows.states.copy(), stated_starts(compiled)
     at = _Readings(compiled=compiled, parameters=parameters, drive=drive, y=y, good=good, scales=scales)
     for k in which:
         start, stop = int(w.starts[k]), int(w.stops[k])
@@ -256,7 +256,7 @@ class _Readings:
         error = np.where(self.good[a:b], self.y[a:b] - simulated[a:b], 0.0) ** 2
         return not float(np.mean(error[-hop:])) <= STRAYS**2 * float(np.mean(error[:hop]))
 
-    def followed(self, window: Windows, iterations: int) -> FloatArray:
+    def follow_state(self, window: Windows, iterations: int) -> FloatArray:
         """Return the state at a window's end, found anew from the readings part by part.
 
         A simulation that strays ends on another swing than the readings, and the next window would begin there.

@@ -19,7 +19,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray, IntArray
 from autotune.equations import opcodes as op
-from autotune.equations.expressions import Call, Expression, Name, Number, parse, substituted
+from autotune.equations.expressions import Call, Expression, Name, Number, parse, substitute
 from autotune.equations.model import EquationModel, Extension
 from autotune.equations.work import Tape
 from autotune.errors import InputError
@@ -338,4 +338,4 @@ def _needed_operations(code: Sequence[tuple[int, ...]], registers: Sequence[int]
 
 def _insert_value(tree: Expression, value: Expression | None) -> Expression:
     """Return an expression of an extension, ``value`` replaced by what would be there without it."""
-    return substituted(tree, lambda name: value if name == "value" else None)
+    return substitute(tree, lambda name: value if name == "value" else None)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from autotune.equations.expressions import Call, Expression, Name, Number, number_text
-from autotune.equations.flatten import flattened
+from autotune.equations.flatten import flatten
 from autotune.equations.model import EquationModel
 
 _GREEK = {
@@ -77,7 +77,7 @@ def as_mathml(model: EquationModel) -> tuple[str, ...]:
 
 def _equations(model: EquationModel, n: _Notation) -> list[tuple[str, str]]:
     """Return both sides of each equation: helpers, states and the output. Effects on samples are refused."""
-    flat = flattened(model)
+    flat = flatten(model)
     lines = [(_symbol(name, n), tree) for name, tree in flat.defines]
     lines += [(n.parts["slope"].format(_symbol(one.name, n)), one.derivative) for one in flat.states]
     return [(left, _set(tree, n)[0]) for left, tree in [*lines, (_symbol("y", n), flat.output)]]

@@ -45,7 +45,7 @@ def _parse_unit(text: str, where: str) -> Unit:
     InputError
         A unit that is not known.
     """
-    found = _parsed(text.strip())
+    found = _parse(text.strip())
     if found is None:
         raise InputError(
             f"the unit {text!r} is not known", where=where, remedy="write e.g. N m, kg m^2, V/s, or leave the unit out"
@@ -54,7 +54,7 @@ def _parse_unit(text: str, where: str) -> Unit:
 
 
 @lru_cache(maxsize=512)
-def _parsed(text: str) -> Unit | None:
+def _parse(text: str) -> Unit | None:
     if text.lower() in PLAIN:
         return Unit(powers=(), factor=0.01 if text == "%" else 1.0)
     for given, known in _SPELT.items():
@@ -77,7 +77,7 @@ def _registry() -> Any:
 
 def understood(text: str) -> Unit | None:
     """Return what a unit's text means; None where it is not known."""
-    return _parsed(text.strip())
+    return _parse(text.strip())
 
 
 def check_units(model: EquationModel) -> None:
@@ -94,12 +94,12 @@ def check_units(model: EquationModel) -> None:
     _check_effects(model)
     if not any(given.values()) and not model.output_unit:
         return
-    known: dict[str, Unit | None] = {"pi": _ONE, "t": _parsed("s")}
+    known: dict[str, Unit | None] = {"pi": _ONE, "t": _parse("s")}
     for name, text in given.items():
         known[name] = _parse_unit(text, f"{model.name}: {name}") if text else None
     for name, tree in model.defines:
         known[name] = _Walk(known, f"{model.name}: [define] {name}").unit(tree)
-    second = _parsed("s")
+    second = _parse("s")
     assert second is not None
     for state in model.states:
         where = f"{model.name}: derivative of {state.name}"
@@ -124,7 +124,7 @@ def _compare(found: Unit | None, wanted: Unit | None, where: str) -> None:
     if found is None or wanted is None:
         return
     if found.powers != wanted.powers:
-        raise InputError(f"gives {shown(found)} where {shown(wanted)} is wanted", where=where,
+        raise InputError(f"gives {unit_text(found)} where {unit_text(wanted)} is wanted", where=where,
                          remedy="correct the expression or a unit in it")  # fmt: skip
     if not _same_size(found, wanted):
         raise InputError(
@@ -146,7 +146,7 @@ def _times(a: Unit, b: Unit, power: float = 1.0) -> Unit:
     return Unit(powers=kept, factor=a.factor * b.factor**power)
 
 
-def shown(unit: Unit) -> str:
+def unit_text(unit: Unit) -> str:
     """Return a unit's base units as a person writes them."""
     short = {"meter": "m", "kilogram": "kg", "second": "s", "ampere": "A", "kelvin": "K", "mole": "mol", "gram": "g"}
     parts = [short.get(n, n) + ("" if p == 1.0 else f"^{p:g}") for n, p in unit.powers]
@@ -200,7 +200,7 @@ class _Walk:
             first_text, first = to_text(given[0][0]), given[0][1]
             if unit.powers != first.powers:
                 raise InputError(
-                    f"{first_text!r} is in {shown(first)}, {to_text(one)!r} in {shown(unit)}",
+                    f"{first_text!r} is in {unit_text(first)}, {to_text(one)!r} in {unit_text(unit)}",
                     where=self._where, remedy="only like units can be added or compared",
                 )  # fmt: skip
             if not _same_size(unit, first):
@@ -229,7 +229,7 @@ class _Walk:
             return
         name = tree.function if isinstance(tree, Call) else "a power"
         if not unit.is_plain:
-            raise InputError(f"{name} of {to_text(argument)!r}, which is in {shown(unit)}", where=self._where,
+            raise InputError(f"{name} of {to_text(argument)!r}, which is in {unit_text(unit)}", where=self._where,
                              remedy="its argument is a plain number or an angle")  # fmt: skip
         if name in ("sin", "cos", "tan") and not _same_size(unit, _ONE):
             raise InputError(f"{name} of {to_text(argument)!r}, which is not in radians", where=self._where,

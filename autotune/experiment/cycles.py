@@ -16,12 +16,12 @@ from autotune.experiment.result import Cycle, Part, Segment
 from autotune.identification.frequency.describing import describing_function
 from autotune.identification.frequency.limit_cycle import WholePeriods
 from autotune.identification.frequency.limit_cycle_points import LimitCycle
-from autotune.identification.frequency.windows import Rows, Windowed, windowed_cycles
+from autotune.identification.frequency.windows import Rows, Windowed, estimate_cycles
 from autotune.points import FrequencyPoint
 from autotune.recording import Recording, read_recording
 
 
-def measured(cycle: Cycle, rows: Rows, sample_time_s: float, known: Sequence[FrequencyPoint]) -> Segment:
+def measure_cycle(cycle: Cycle, rows: Rows, sample_time_s: float, known: Sequence[FrequencyPoint]) -> Segment:
     """Return the cycle with its point.
 
     Parameters
@@ -79,7 +79,9 @@ def noise_of(segments: Sequence[Segment]) -> float:
     return median_low(one.noise_sd for one in segments)
 
 
-def refined(segments: Sequence[Segment], rows: Callable[[int], Rows], sample_time_s: float) -> tuple[Segment, ...]:
+def refine_cycles(
+    segments: Sequence[Segment], rows: Callable[[int], Rows], sample_time_s: float
+) -> tuple[Segment, ...]:
     """Return every cycle estimated once more from the recorded rows, now that the others make a better rough model.
 
     Parameters
@@ -91,7 +93,7 @@ def refined(segments: Sequence[Segment], rows: Callable[[int], Rows], sample_tim
     sample_time_s : float
         Control period [s].
     """
-    found = windowed_cycles([_window(one, rows(one.part), sample_time_s) for one in segments])
+    found = estimate_cycles([_window(one, rows(one.part), sample_time_s) for one in segments])
     return tuple(_segment(one, cycle, sample_time_s) for one, cycle in zip(segments, found, strict=True))
 
 
@@ -159,7 +161,7 @@ def read_earlier(paths: Sequence[Path], sample_time_s: float) -> Earlier:
         cycles = _read_finished(recording, len(recordings))
         for cycle in cycles:
             known = [one.point for one in segments]
-            segments.append(measured(cycle, (recording.t, recording.u, recording.y), sample_time_s, known))
+            segments.append(measure_cycle(cycle, (recording.t, recording.u, recording.y), sample_time_s, known))
         first_move_s = float(recording.metadata.get("first_move_s", math.nan))
         parts.append(
             Part(

@@ -10,7 +10,7 @@ from autotune.experiment.loop import Timing
 LEAST_SAMPLES = 8
 
 
-def supported_rad_s(timing: Timing, sample_time_s: float, gain_sd: float, *, exact: bool) -> float:
+def highest_frequency_rad_s(timing: Timing, sample_time_s: float, gain_sd: float, *, exact: bool) -> float:
     """Return the frequency up to which a point's error from the link stays within the wanted standard deviation.
 
     Parameters

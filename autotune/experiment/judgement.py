@@ -208,8 +208,8 @@ def expectation(
     prediction = predict(
         fit.plant, draws, law, test.setpoint, test.disturbance, noise_sd, rng, u_rest=u_rest, thin=thin
     )
-    expected = smoothed(prediction.y, test)
-    responses = tuple(smoothed(draw, test) for draw in prediction.y_draws)
+    expected = smooth_steps(prediction.y, test)
+    responses = tuple(smooth_steps(draw, test) for draw in prediction.y_draws)
     explained = float(np.quantile([_rms(response - expected) for response in responses], 0.99))
     # the response counts from the set-point, where the loop is to bring it
     allowed = math.hypot(explained, TOLERANCE * _rms(expected - test.setpoint))
@@ -265,8 +265,8 @@ def judge(
     """
     expected = expectation(test, law, fit, noise_sd, u_rest=u_rest, seed=seed)
     usable = np.isfinite(y)
-    measured = smoothed(np.where(usable, y, np.interp(test.t, test.t[usable], y[usable])), test)
-    rms_error = _rms(measured - smoothed(expected.prediction.y, test))
+    measured = smooth_steps(np.where(usable, y, np.interp(test.t, test.t[usable], y[usable])), test)
+    rms_error = _rms(measured - smooth_steps(expected.prediction.y, test))
     accepted = rms_error <= expected.allowed and not expected.is_vacuous
     misread = running_law is not None and bool(running_law.misreading)
     drawn = [_figures(test, response) for response in expected.responses]
@@ -319,7 +319,7 @@ def _over(drawn: Sequence[StepFigures], statistic: Callable[[list[float]], Any])
     )
 
 
-def smoothed(y: FloatArray, test: StepTest) -> FloatArray:
+def smooth_steps(y: FloatArray, test: StepTest) -> FloatArray:
     """Return the centred moving average over the test's smoothing, step by step so that a step stays a step.
 
     Parameters

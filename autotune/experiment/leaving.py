@@ -52,13 +52,13 @@ def leave(rig: Rig, error: BaseException | None, restore: Callable[[], None] | N
         Puts back what the session changed in the rig's own controller: under the host's command before that controller
         gets the actuator, or once the rig is safe. Whoever gives it looks whether it has been done.
     """
-    farewell = _left(rig, error, restore)
+    farewell = _leave(rig, error, restore)
     with contextlib.suppress(Exception):  # a driver may raise what it likes here: the rig is left already
         rig.close()
     return farewell
 
 
-def _left(rig: Rig, error: BaseException | None, restore: Callable[[], None] | None) -> Farewell:
+def _leave(rig: Rig, error: BaseException | None, restore: Callable[[], None] | None) -> Farewell:
     if isinstance(error, NotTaken):
         return Farewell(output=NOT_TAKEN)
     former = rig.former if isinstance(rig, HandsBack) else None

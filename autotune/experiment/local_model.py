@@ -111,7 +111,7 @@ def lag_beyond_integrator(point: FrequencyPoint, plant_sign: int) -> float:
     return -phase % (2.0 * math.pi) - math.pi / 2.0
 
 
-def predicted(points: Sequence[FrequencyPoint], plant_sign: int, phase_rad: float) -> tuple[float, LocalModel]:
+def predict_crossing(points: Sequence[FrequencyPoint], plant_sign: int, phase_rad: float) -> tuple[float, LocalModel]:
     """Return the frequency [rad/s] at which the plant is expected to have the phase, and a model of it there.
 
     The tangent of the lag beyond -90 deg is close to a power of omega for everything that lags by more, the tangent of

@@ -20,7 +20,7 @@ from autotune.experiment.foreign import describe_foreign
 from autotune.experiment.leaving import leave, say, verdict_on
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.monitor import ReadingMonitor
-from autotune.experiment.priority import GoesOn, undisturbed
+from autotune.experiment.priority import GoesOn, raise_priority
 from autotune.experiment.rig import Exchanges, Feeds, Reading, Rig, Row, RunsRelay
 from autotune.experiment.rows import KEPT_ROWS, RecentRows
 from autotune.experiment.timing import Tick, Timing
@@ -145,7 +145,7 @@ class ControlLoop:
         warm_up()
         # a flag the loop looks at, so that no frame on the link is torn in two
         self._exits.enter_context(signals_heard(*_SIGNALS, by=lambda number: self._on_signal(_SIGNALS[number])))
-        self._exits.enter_context(undisturbed(self.rig.clock))
+        self._exits.enter_context(raise_priority(self.rig.clock))
         try:
             self.rig.open()
             self._start_s = self._deadline_s = self.rig.clock.now()
@@ -154,7 +154,7 @@ class ControlLoop:
             self._reading = self.rig.read()
             held = self._reading.u_applied if math.isfinite(self._reading.u_applied) else limits.u_safe
             self._device_start_s = self._reading.device_time_s
-            self.tick = self._judged(self._reading, u=min(max(held, limits.u_min), limits.u_max))
+            self.tick = self._judge(self._reading, u=min(max(held, limits.u_min), limits.u_max))
             if self._exchange is not None:
                 self._write_row(held, {})
         except BaseException as error:
@@ -186,7 +186,7 @@ class ControlLoop:
             self._wait()
             applied = self._reading.u_applied
             self._reading = self._exchange(u)
-            self.tick = self._judged(self._reading, u=u)
+            self.tick = self._judge(self._reading, u=u)
             # what acts, to the converter's last count
             acting = self._reading.u_applied if math.isfinite(self._reading.u_applied) else u
             self._write_row(acting, {"u_applied": applied, **(extra or {})})
@@ -196,7 +196,7 @@ class ControlLoop:
         self._decisions.append(self.rig.clock.now() - self._reading.t_s)
         self._wait()
         self._reading = self.rig.read()
-        self.tick = self._judged(self._reading, u=u)
+        self.tick = self._judge(self._reading, u=u)
         return self.tick
 
     @property
@@ -224,7 +224,7 @@ class ControlLoop:
         self._write_row(applied, extra or {})
         self._wait()
         self._reading = self.rig.read()
-        self.tick = self._judged(self._reading, u=self.applied)
+        self.tick = self._judge(self._reading, u=self.applied)
         return self.tick
 
     def hold_while(self, action: Callable[[], None]) -> Tick:
@@ -243,7 +243,7 @@ class ControlLoop:
         self.tick = replace(self.tick, slot=self.tick.slot + gap)
         self._wait()
         self._reading = self.rig.read()
-        self.tick = self._judged(self._reading, u=u)
+        self.tick = self._judge(self._reading, u=u)
         return self.tick
 
     def begin(self, reading: Reading) -> None:
@@ -252,7 +252,7 @@ class ControlLoop:
             if not self._is_written:
                 self._write_row(self.tick.u, {})
             self._reading, self._slots = reading, 1
-            self.tick = self._judged(reading, u=reading.u_applied)
+            self.tick = self._judge(reading, u=reading.u_applied)
 
     def follow(self, row: Row, *, extra: Mapping[str, float] | None = None) -> Tick:
         """Take a row of a law that the device runs by itself, and return its sample; a row lost on the line is NaN."""
@@ -267,7 +267,7 @@ class ControlLoop:
             self._write_row(row.u_mean, extra or {})
         self._reading, self._slots = row.reading, 1  # what the host missed before is none of the device's
         self._deadline_s = self.rig.clock.now()
-        self.tick = self._judged(row.reading, u=row.reading.u_applied)
+        self.tick = self._judge(row.reading, u=row.reading.u_applied)
         return self.tick
 
     @property
@@ -369,7 +369,7 @@ class ControlLoop:
         """Whether the latest sample's row is on the disk."""
         return self.tick.k < len(self._rows)
 
-    def _judged(self, reading: Reading, *, u: float) -> Tick:
+    def _judge(self, reading: Reading, *, u: float) -> Tick:
         if math.isfinite(reading.latency_s):
             self._latency.append(reading.latency_s)
         t_s = self._time_of(reading)

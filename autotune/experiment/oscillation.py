@@ -43,7 +43,7 @@ def noise_half(loop: ControlLoop) -> float:
     return 2.0 * 1.4826 * float(np.median(bends)) / math.sqrt(6.0) if bends.size else 0.0
 
 
-def jumped(loop: ControlLoop) -> bool:
+def is_jump(loop: ControlLoop) -> bool:
     """Return whether y came where it is in one step that no earlier one resembles, lost samples counted."""
     t, _, y = loop.history(max(0, loop.tick.k - NOISE_ROWS))
     known = np.isfinite(y)
@@ -258,7 +258,7 @@ class Oscillation:
                 f" around {self.settings.y_centre:g}",
                 remedy="unload the computer or the link (autotune doctor measures it), or raise signals.sample_time_s",
             )
-        if jumped(self.loop):
+        if is_jump(self.loop):
             return ExperimentStopped(
                 f"the sensor jumps: y = {y:.4g} left the swing of {limits.swing:g} around {self.settings.y_centre:g} in"
                 " one step",

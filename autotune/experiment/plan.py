@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autotune.experiment.local_model import lag_beyond_integrator, predicted
+from autotune.experiment.local_model import lag_beyond_integrator, predict_crossing
 from autotune.experiment.relay import RelaySettings
 from autotune.points import FrequencyPoint
 
@@ -132,7 +132,7 @@ def choose(
     plant_sign : {-1, 1}
         Sign of the plant's gain.
     """
-    omega, model = predicted(points, plant_sign, phase_rad)
+    omega, model = predict_crossing(points, plant_sign, phase_rad)
     period = 2.0 * math.pi / omega / goal.sample_time_s
     largest = goal.peak / (model.crest(omega) * model.gain(omega) * 4.0 / math.pi)
     amplitude = goal.amplitude if goal.amplitude is not None else min(largest, goal.u_room)

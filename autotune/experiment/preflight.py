@@ -12,7 +12,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.config.procedure import OperatingPointSettings
 from autotune.errors import ExperimentStopped, LinkError
-from autotune.experiment.feasibility import supported_rad_s
+from autotune.experiment.feasibility import highest_frequency_rad_s
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.monitor import RECENT
 from autotune.experiment.rig import Exchanges, RunsRelay
@@ -112,7 +112,7 @@ def preflight(loop: ControlLoop, point: OperatingPointSettings, gain_sd: float, 
             where="preflight",
             remedy="raise signals.sample_time_s, or use a faster link",
         )
-    link_rad_s = supported_rad_s(timing, loop.sample_time_s, gain_sd, exact=loop.is_exact)
+    link_rad_s = highest_frequency_rad_s(timing, loop.sample_time_s, gain_sd, exact=loop.is_exact)
     tell(
         f"a reading takes {1e3 * typical:.2g} ms, up to {1e3 * late:.2g} ms in 99 %, and the loop is up to"
         f" {1e3 * timing.lateness_s[1]:.2g} ms late: this link supports points up to {link_rad_s:.3g} rad/s"

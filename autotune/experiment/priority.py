@@ -28,7 +28,7 @@ def spare_collections() -> None:
 
 
 @contextlib.contextmanager
-def undisturbed(clock: object) -> Iterator[None]:
+def raise_priority(clock: object) -> Iterator[None]:
     """Let this thread run before others, and small matrices not on all cores, where the clock waits for nobody.
 
     Parameters

@@ -13,7 +13,7 @@ import numpy as np
 from autotune.config import Config
 from autotune.errors import AutotuneError, ExperimentStopped
 from autotune.experiment.approach import approach, find_midpoint
-from autotune.experiment.cycles import Earlier, noise_of, refined
+from autotune.experiment.cycles import Earlier, noise_of, refine_cycles
 from autotune.experiment.device import DeviceOscillation
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.loop import ControlLoop, Timing
@@ -96,7 +96,7 @@ def run_experiment(
     if not missing_phases(config.experiment, earlier):
         last_part = len(earlier.recordings) - 1
         kept = [one for one in earlier.segments if one.part == last_part or not is_together(earlier)]
-        final = refined(kept, earlier.rows, config.signals.sample_time_s)
+        final = refine_cycles(kept, earlier.rows, config.signals.sample_time_s)
         last = earlier.recordings[-1].metadata
         known = Known(first_move_s=last.get("first_move_s", math.nan), link_rad_s=last.get("link_rad_s", math.inf))
         timing = Timing.from_table(last.get("timing", {}))
@@ -111,7 +111,7 @@ def run_experiment(
         return loop.history() if number == sitting else earlier.rows(number)
 
     # all cycles together, which takes many samples' time: the rig has been handed back
-    final = refined(swept.segments, rows, config.signals.sample_time_s)
+    final = refine_cycles(swept.segments, rows, config.signals.sample_time_s)
     parts = (*earlier.parts, swept.part)
     result = _result(final, config, parts, loop.timing, swept.known, loop.metadata, loop.history())
     return replace(result, output=loop.metadata["ended"]["output"], warnings=(*result.warnings, *loop.foreign))
@@ -283,7 +283,10 @@ def _result(
         sweep_time_s=sum(part.sweep_time_s for part in parts),
         parts=parts,
         reason="completed",
-        warnings=(*sweep_warnings(segments, config.experiment, known.link_rad_s, together), *_missed_text(timing)),
+        warnings=(
+            *sweep_warnings(segments, config.experiment, known.link_rad_s, together),
+            *_missed_text(timing),
+        ),
         together=together,
         by_itself=reason_noted(noted),
     )

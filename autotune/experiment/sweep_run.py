@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from autotune.config.procedure import ExperimentSettings
 from autotune.errors import ExperimentStopped, IdentificationError
-from autotune.experiment.cycles import Earlier, measured, noise_of
+from autotune.experiment.cycles import Earlier, measure_cycle, noise_of
 from autotune.experiment.limit_cycle_run import run_limit_cycle
 from autotune.experiment.limits import Envelope
 from autotune.experiment.loop import ControlLoop
@@ -134,7 +134,7 @@ class SweepRun:
             periods=window.periods,
         )
         try:
-            segment = measured(cycle, loop.history(), loop.sample_time_s, known.points if known.swept else ())
+            segment = measure_cycle(cycle, loop.history(), loop.sample_time_s, known.points if known.swept else ())
         except IdentificationError as error:
             raise ExperimentStopped(error.what, where=State.SWEEP.value, remedy=error.remedy) from error
         if self.by_itself:
@@ -165,7 +165,7 @@ class SweepRun:
         """
         self.looks += 1
         self.tell("estimating all points together", 0.0)
-        others = self._unvisited(phases_rad)
+        others = self._remaining_phases(phases_rad)
         found = estimate_beside(self.oscillation, self.cycles, others, self.known, self.looks, price)
         return replace(found, why="commands of another master" if self.loop.monitor.commands.found else found.why)
 
@@ -179,10 +179,10 @@ class SweepRun:
         phases_rad : sequence of float
             Phases of the positive-gain plant at which points were wanted [rad].
         """
-        noted = note_of(found.estimate, found.why, len(self.cycles), self._unvisited(phases_rad))
+        noted = note_of(found.estimate, found.why, len(self.cycles), self._remaining_phases(phases_rad))
         self.loop.note(**{NOTED: noted})
 
-    def _unvisited(self, phases_rad: Sequence[float]) -> list[float]:
+    def _remaining_phases(self, phases_rad: Sequence[float]) -> list[float]:
         """Return the phases without a limit cycle, as they are of the plant, its sign included."""
         turned = 0.0 if self.known.plant_sign > 0 else math.pi
         return [phase + turned for phase in phases_rad if not is_aimed(phase, self.cycles)]

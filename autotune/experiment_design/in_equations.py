@@ -21,7 +21,7 @@ from autotune.experiment_design.plan import ROOM_SHARE
 HOLDS, ROWS = (0.01, 0.03, 0.1), 1000
 
 
-def planned_in_equations(found: Diagnosis) -> NextExperiment | None:
+def plan_in_equations(found: Diagnosis) -> NextExperiment | None:
     """Return the excitation under which the open hypotheses of equations differ most.
 
     Parameters

@@ -16,8 +16,8 @@ from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment, to
 from autotune.effects import kind_of
 from autotune.errors import InputError
 from autotune.experiment_design.conditions import as_recorded, is_driven
-from autotune.experiment_design.in_equations import planned_in_equations
-from autotune.experiment_design.open_hypotheses import decided, open_hypotheses
+from autotune.experiment_design.in_equations import plan_in_equations
+from autotune.experiment_design.open_hypotheses import only_hypothesis, open_hypotheses
 from autotune.experiment_design.plan import plan_in
 
 #: Rows of a planned experiment: enough to rank the kinds.
@@ -39,7 +39,7 @@ def next_experiment(found: Diagnosis) -> NextExperiment | None:
     """
     of_equations = isinstance(found.search, EquationSearch)
     if found.verdict in ("none", "parameters"):
-        return None if of_equations or decided(found) else _plan(found)
+        return None if of_equations or only_hypothesis(found) else _plan(found)
     if not found.places:
         return None
     for effect in found.effects:
@@ -56,7 +56,7 @@ def next_experiment(found: Diagnosis) -> NextExperiment | None:
 def _plan(found: Diagnosis) -> NextExperiment | None:
     """Return the experiment that separates the hypotheses alive best; nothing where none does."""
     if isinstance(found.search, EquationSearch):
-        return planned_in_equations(found) if is_driven(found) else None
+        return plan_in_equations(found) if is_driven(found) else None
     if len(open_hypotheses(found)) < 2 or not is_driven(found):
         return None
     recorded = as_recorded(found)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.hypothesis import Hypothesis
-from autotune.effects import called
+from autotune.effects import shared_name
 
 
 def open_hypotheses(found: Diagnosis) -> dict[str, tuple[Hypothesis, float]]:
@@ -36,7 +36,7 @@ def open_hypotheses(found: Diagnosis) -> dict[str, tuple[Hypothesis, float]]:
     return {label: (h, max(p, limits.still_open)) for label, h, p in few}
 
 
-def decided(found: Diagnosis) -> str:
+def only_hypothesis(found: Diagnosis) -> str:
     """Return the hypothesis that is left, with all that u and y cannot tell from it; empty where several are."""
     hypotheses = open_hypotheses(found)
     best, (h, p) = next(iter(hypotheses.items()))
@@ -50,4 +50,4 @@ def _gains(h: Hypothesis, chosen: Hypothesis) -> bool:
 
 
 def _class(names: frozenset[str]) -> frozenset[str]:
-    return frozenset(map(called, names))
+    return frozenset(map(shared_name, names))

@@ -95,7 +95,7 @@ def _within_swing(
     """Return the plan of an excitation, made smaller where a hypothesis predicts more than the allowed swing."""
     for share in (1.0, 0.5, 0.25):
         smaller = replace(one, amplitude=float(f"{share * one.amplitude:.4g}"))
-        planned = planned_recording(found.search.retuned.fit.sim, conditions, smaller)
+        planned = predict_recording(found.search.retuned.fit.sim, conditions, smaller)
         if planned is None:
             continue
         plan, y = _rate_excitation(found, hypotheses, smaller, planned)
@@ -139,7 +139,7 @@ def excitations(sim: Simulator, conditions: Conditions, duration_s: float, seed:
         if on == "set-point" and kind in ("pulses", "sweep"):
             continue  # the law smooths what is fast; the command carries it unchanged
         trial = Excitation(kind=kind, on=on, amplitude=unit[on], hold_s=hold, duration_s=duration_s, seed=seed)
-        scale = _allowed_scale(sim, conditions, trial)
+        scale = _scale_to_limits(sim, conditions, trial)
         if scale > 0.0:
             found.append(replace(trial, amplitude=float(f"{scale * trial.amplitude:.4g}")))
     return found
@@ -154,10 +154,10 @@ def _slowest_s(sim: Simulator, conditions: Conditions) -> float:
     return slowest_lag_s(np.linalg.eigvals(A))
 
 
-def _allowed_scale(sim: Simulator, conditions: Conditions, trial: Excitation) -> float:
+def _scale_to_limits(sim: Simulator, conditions: Conditions, trial: Excitation) -> float:
     """Return the factor at which a trial excitation takes its share of the limits, by the linear prediction."""
     limits, centre = conditions.limits, conditions.y
-    planned = planned_recording(sim, conditions, trial, unlimited=True)
+    planned = predict_recording(sim, conditions, trial, unlimited=True)
     if planned is None:
         return 0.0
     u_hold = float(planned.u[0])
@@ -167,7 +167,7 @@ def _allowed_scale(sim: Simulator, conditions: Conditions, trial: Excitation) ->
     return max(0.0, min(room_y / max(moved_y, 1e-12), room_u / max(moved_u, 1e-12)))
 
 
-def planned_recording(
+def predict_recording(
     sim: Simulator, conditions: Conditions, excitation: Excitation, *, unlimited: bool = False
 ) -> Recording | None:
     """Return what the linear chain would record under an excitation, None where its loop runs away.

@@ -104,7 +104,7 @@ def are_flags(cells: Cells) -> bool:
     return {cell.strip().lower() for cell in cells} <= {*GOOD, *_BAD, ""}
 
 
-def held(values: FloatArray, missing: BoolArray) -> FloatArray:
+def fill_forward(values: FloatArray, missing: BoolArray) -> FloatArray:
     """Return the values with each missing one as the one before it; those at the beginning stay as they are.
 
     Parameters

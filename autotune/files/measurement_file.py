@@ -16,7 +16,7 @@ from autotune.arrays import FloatArray
 from autotune.errors import InputError, require_extra
 from autotune.files.array_columns import ABOUT, HDF5, MATLAB, MDF
 from autotune.files.cells import Cells
-from autotune.files.table import Table, bare_and_unit, listed
+from autotune.files.table import Table, bare_and_unit, list_names
 
 KINDS = (*MATLAB, *HDF5, *MDF)
 #: Rows of each end of a column that are looked at; how long reading may take [s].
@@ -45,7 +45,7 @@ def measurement_table(path: Path) -> Table:
     rows, count = max(lengths.items(), key=lambda pair: (pair[1], pair[0]), default=(0, 0))
     if count < 2:
         raise InputError(
-            f"no two columns of numbers have one length ({listed(found) or 'it holds no arrays'})", where=str(path),
+            f"no two columns of numbers have one length ({list_names(found) or 'it holds no arrays'})", where=str(path),
             remedy="save time, command and measurement as arrays of one length, or as CSV",
         )  # fmt: skip
     kept = {name: values for name, values in found.items() if values.size == rows}

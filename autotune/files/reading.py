@@ -13,14 +13,14 @@ import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.errors import InputError
-from autotune.files.signal_names import Roles, SignalNames, confirmed, find_roles
+from autotune.files.signal_names import Roles, SignalNames, confirm_roles, find_roles
 from autotune.files.stamps import StampForm
-from autotune.files.stretches import on_change, on_grid, stamped, stretch, stretches
-from autotune.files.table import FileForm, Table, listed
+from autotune.files.stretches import on_change, on_grid, repair_stamps, stretch, stretches
+from autotune.files.table import FileForm, Table, list_names
 from autotune.files.table_signals import signals_of
 from autotune.files.workbook import open_table
 from autotune.recording import Recording, is_own_form, read_recording, read_sidecar
-from autotune.text_files import checked_path
+from autotune.text_files import check_path
 
 #: What asks somebody for a column: what for, the file's columns, the best guess.
 Ask: TypeAlias = Callable[[str, Sequence[str], str], str]
@@ -88,7 +88,7 @@ def read_recordings(
     InputError
         The file cannot be read, or a column is not sure and nobody is there to ask.
     """
-    path, given, form = checked_path(path), names or SignalNames(), form or FileForm()
+    path, given, form = check_path(path), names or SignalNames(), form or FileForm()
     if given == SignalNames() and form == FileForm() and is_own_form(path):
         return Reading(recordings=(read_recording(path),), names=SignalNames(t="t", u="u", y="y"))
     table = open_table(path, form)
@@ -110,12 +110,12 @@ def _confirm(table: Table, roles: Roles, ask: Ask | None) -> Roles:
         missing = " and ".join(_ROLE[role] for role in roles.unsure)
         options = " ".join(f'--{role} "{guess[role] or "COLUMN"}"' for role in roles.unsure)
         raise InputError(
-            f"which column is the {missing} is not sure; it has {listed(map(table.described, table.names), 12)}",
+            f"which column is the {missing} is not sure; it has {list_names(map(table.described, table.names), 12)}",
             where=table.path,
             remedy=f"name them, for example {options}, or write the project's form with autotune import",
         )
     answers = {role: table.name_of(ask(_ROLE[role], table.names, guess[role])) for role in roles.unsure}
-    return confirmed(roles, answers)
+    return confirm_roles(roles, answers)
 
 
 def parts_of(
@@ -141,7 +141,7 @@ def parts_of(
     InputError
         Fewer than two rows, or none with both a command and a measurement.
     """
-    columns = stamped(columns, notes)
+    columns = repair_stamps(columns, notes)
     if columns["t"].size < 2:
         raise InputError(f"{columns['t'].size} row(s)", where=where, remedy="a recording needs at least two rows")
     if np.all(np.diff(columns["t"]) > 0.0) and on_change(columns["t"], columns["u"], columns["y"]):

@@ -292,7 +292,7 @@ def _held_share(table: Table, name: str) -> float:
     return float(np.mean(np.diff(known) == 0.0)) if known.size > 1 else 0.0
 
 
-def confirmed(roles: Roles, answers: Mapping[str, str]) -> Roles:
+def confirm_roles(roles: Roles, answers: Mapping[str, str]) -> Roles:
     """Return the roles with what somebody answered.
 
     Parameters

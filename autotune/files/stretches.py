@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
-from autotune.files.cells import held
+from autotune.files.cells import fill_forward
 
 #: A gap this many usual steps long cuts a record, unless something else is asked for.
 LONGEST_GAP_STEPS = 10.0
@@ -19,7 +19,7 @@ _MOST_GRID_ROWS = 200_000
 _FEWEST_STEPS = 30
 
 
-def stamped(columns: Mapping[str, FloatArray], notes: list[str]) -> dict[str, FloatArray]:
+def repair_stamps(columns: Mapping[str, FloatArray], notes: list[str]) -> dict[str, FloatArray]:
     """Leave out rows without a stamp and rows that repeat the stamp before them, or spread them where all do.
 
     Parameters
@@ -124,7 +124,7 @@ def on_grid(columns: Mapping[str, FloatArray], notes: list[str]) -> dict[str, Fl
             known = np.isfinite(values)
             even[name] = np.asarray(np.interp(grid, t[known], values[known]), dtype=np.float64)
         elif name != "t":
-            even[name] = held(values, ~np.isfinite(values))[at]
+            even[name] = fill_forward(values, ~np.isfinite(values))[at]
     return even
 
 
@@ -181,5 +181,5 @@ def stretch(columns: Mapping[str, FloatArray], at: IntArray) -> dict[str, FloatA
     tells = np.isfinite(part["y"]) | np.concatenate([[True], np.diff(part["u"]) != 0.0])
     part = {name: values[tells] for name, values in part.items()}
     if "r" in part:
-        part["r"] = held(part["r"], ~np.isfinite(part["r"]))
+        part["r"] = fill_forward(part["r"], ~np.isfinite(part["r"]))
     return part

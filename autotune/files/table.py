@@ -97,11 +97,13 @@ class Table:
             if len(found) == 1:
                 return found[0]
             if found:
-                raise InputError(f"more than one column {asked!r}", where=self.path, remedy=f"it has {listed(found)}")
+                raise InputError(
+                    f"more than one column {asked!r}", where=self.path, remedy=f"it has {list_names(found)}"
+                )
         if asked.isdigit() and 1 <= int(asked) <= len(self.names):
             return self.names[int(asked) - 1]
         near = difflib.get_close_matches(asked, self.names, n=1, cutoff=0.5)
-        shown = f"did you mean {near[0]!r}?" if near else f"it has {listed(self.names)}"
+        shown = f"did you mean {near[0]!r}?" if near else f"it has {list_names(self.names)}"
         raise InputError(f"no column {asked!r}", where=self.path, remedy=shown)
 
     def bare(self, name: str) -> str:
@@ -123,7 +125,7 @@ def bare_and_unit(name: str) -> tuple[str, str]:
     return name.strip(), ""
 
 
-def listed(names: Iterable[str], most: int = 8) -> str:
+def list_names(names: Iterable[str], most: int = 8) -> str:
     """Return names for a message, the first few of many.
 
     Parameters

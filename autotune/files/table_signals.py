@@ -9,10 +9,10 @@ import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.errors import InputError
-from autotune.files.cells import GOOD, Cells, are_flags, good_samples, held, numbers
+from autotune.files.cells import GOOD, Cells, are_flags, fill_forward, good_samples, numbers
 from autotune.files.signal_names import Roles
 from autotune.files.stamps import StampForm, detect_form, form_of_strptime, seconds
-from autotune.files.table import FileForm, Table, listed
+from autotune.files.table import FileForm, Table, list_names
 
 _MOST_OTHERS = 8
 _FLAG_NAMES = (
@@ -70,7 +70,7 @@ def signals_of(table: Table, roles: Roles, form: FileForm) -> Signals:
     notes: list[str] = []
     others = roles.others if len(roles.others) <= _MOST_OTHERS else ()
     if len(roles.others) > _MOST_OTHERS:
-        notes.append(f"{len(roles.others)} further columns are left out: {listed(roles.others, 4)}")
+        notes.append(f"{len(roles.others)} further columns are left out: {list_names(roles.others, 4)}")
     signals = {role: name for role in ("u", "y", "r") if (name := getattr(roles.names, role))}
     signals |= {table.bare(name): name for name in others if table.bare(name) not in ("t", "u", "y", "r")}
     flags = {name: flag for name in signals.values() if (flag := _flag_of(table, name, form.quality))}
@@ -85,7 +85,7 @@ def signals_of(table: Table, roles: Roles, form: FileForm) -> Signals:
             bad = ~good_samples(cells[flags[name]], form.good or GOOD) & ~empty
             values = np.where(bad, np.nan, values)
             flagged |= bad & (key in ("u", "y"))
-        columns[key] = held(values, empty) if form.empty_unchanged else values
+        columns[key] = fill_forward(values, empty) if form.empty_unchanged else values
     if flagged.any():
         notes.append(f"{int(flagged.sum())} rows are flagged as bad")
     return Signals(columns=columns, flagged=flagged, stamp=stamp, notes=tuple(notes))

@@ -18,7 +18,7 @@ from autotune.files.header import Header, read_header
 from autotune.files.long_form import one_column_per_tag
 from autotune.files.measurement_file import KINDS as MEASUREMENTS
 from autotune.files.measurement_file import measurement_table
-from autotune.files.table import FileForm, Table, bare_and_unit, listed
+from autotune.files.table import FileForm, Table, bare_and_unit, list_names
 from autotune.files.text_file import text_table
 
 PARQUET = (".parquet", ".pq")
@@ -63,7 +63,9 @@ def _of_workbook(path: Path, form: FileForm) -> Table:
         book = python_calamine.CalamineWorkbook.from_path(path)
         names = book.sheet_names if form.sheet is None else [form.sheet]
         if form.sheet is not None and form.sheet not in book.sheet_names:
-            raise InputError(f"no sheet {form.sheet!r}", where=str(path), remedy=f"it has {listed(book.sheet_names)}")
+            raise InputError(
+                f"no sheet {form.sheet!r}", where=str(path), remedy=f"it has {list_names(book.sheet_names)}"
+            )
         sheets = {name: book.get_sheet_by_name(name).to_python() for name in names}
     except InputError:
         raise

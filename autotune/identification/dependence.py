@@ -127,7 +127,7 @@ def require_order(recordings: Sequence[Recording]) -> None:
     found = [recorded_dependence(recording) for recording in moving]
     answers = any(one.answers for one in found) or any(map(_answers_a_test, moving, found))
     if found and not answers and _seem_swapped(found):
-        raise _swapped(recordings)
+        raise _refusal_of_swapped(recordings)
 
 
 def only_follows(recordings: Sequence[Recording]) -> bool:
@@ -165,7 +165,7 @@ def _seem_swapped(found: Sequence[Dependence]) -> bool:
     return min(one.backward for one in found) * len(found) < CHANCE and not _in_row(found)
 
 
-def _swapped(recordings: Sequence[Recording]) -> IdentificationError:
+def _refusal_of_swapped(recordings: Sequence[Recording]) -> IdentificationError:
     return IdentificationError(
         "u and y seem swapped: u answers y, and y does not answer u",
         where=", ".join(recording.name for recording in recordings),
@@ -201,7 +201,7 @@ def require_answer(recordings: Sequence[Recording]) -> None:
         return
     where = ", ".join(recording.name for recording in recordings)
     if _seem_swapped(found):
-        raise _swapped(recordings)
+        raise _refusal_of_swapped(recordings)
     if _in_row(found):
         raise IdentificationError(
             "u does nothing but follow y, as a controller does that nobody disturbs: this says nothing of the plant, "
@@ -217,11 +217,11 @@ def require_answer(recordings: Sequence[Recording]) -> None:
 
 def _answers_a_test(recording: Recording, found: Dependence) -> bool:
     """Return whether y answers a few steps or ramps as a plant does, beyond what any colour of noise explains."""
-    from autotune.identification.plant_evidence import NEEDED, explained_by_plant, is_simple_test
+    from autotune.identification.plant_evidence import NEEDED, is_simple_test, plant_evidence
 
     if abs(found.same_row) > _SAME_ROW or not is_simple_test(_bridge(recording.u)):
         return False
-    return explained_by_plant(recording) > NEEDED
+    return plant_evidence(recording) > NEEDED
 
 
 def _is_constant(values: FloatArray) -> bool:

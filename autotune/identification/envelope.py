@@ -47,7 +47,7 @@ class Envelope:
         last = int(beyond[0]) if beyond.size else self.omega_rad_s.size - 1
         return np.asarray(np.arange(self.omega_rad_s.size) <= last)
 
-    def joined(self, other: Envelope) -> Envelope:
+    def join_with(self, other: Envelope) -> Envelope:
         """Return both sets of bounds on the union of the frequencies."""
         order = np.argsort(np.concatenate([self.omega_rad_s, other.omega_rad_s]), kind="stable")
         return Envelope(

@@ -81,13 +81,13 @@ def plant_fit(equations: Sequence[Equation]) -> PlantFit:
     rows = min(one.rows for one in equations)
     return not_excluded(
         [
-            joined([one], None, one.unknown, rows * 2.0 * math.log(one.noise_sd) + one.unknown * math.log(rows))
+            join_fits([one], None, one.unknown, rows * 2.0 * math.log(one.noise_sd) + one.unknown * math.log(rows))
             for one in equations
         ]
     )
 
 
-def joined(equations: Sequence[Equation], unit: int | None, coefficients: int, criterion: float) -> PlantFit:
+def join_fits(equations: Sequence[Equation], unit: int | None, coefficients: int, criterion: float) -> PlantFit:
     """Return the fit of one structure to all recordings: information adds, and so do the criteria.
 
     Parameters

@@ -218,7 +218,7 @@ def _fit_structure(
     """Weighted least squares from several starts, with the exact derivatives of the response."""
     middle = float(np.exp(np.mean(np.log(omega))))
 
-    def whitened(values: ComplexArray) -> FloatArray:
+    def whiten(values: ComplexArray) -> FloatArray:
         parts = np.stack([values.real, values.imag], axis=-1)
         return np.asarray(np.einsum("nij,...nj->...ni", whitener, parts)).reshape(*values.shape[:-1], -1)
 
@@ -226,14 +226,14 @@ def _fit_structure(
         s = 1j * omega
         tau = np.exp(parameters[1:-1])[:, np.newaxis]
         derivatives = np.vstack([np.ones((1, omega.size)), -s * tau / (1 + s * tau), -s[np.newaxis]])
-        return whitened(derivatives * _response(omega, parameters, sign, integrating)).T
+        return whiten(derivatives * _response(omega, parameters, sign, integrating)).T
 
     def fit(sign: int, ratios: Sequence[float]) -> OptimizeResult:
         start = np.array([0.0, *(math.log(ratio / middle) for ratio in ratios), 0.1 / middle])
         start[0] = float(np.mean(np.log(np.abs(measured / _response(omega, start, sign, integrating)))))
 
         def residuals(x: FloatArray) -> FloatArray:
-            return whitened(_response(omega, x, sign, integrating) - measured)
+            return whiten(_response(omega, x, sign, integrating) - measured)
 
         def derivatives(x: FloatArray) -> FloatArray:
             return jacobian(x, sign)
@@ -256,7 +256,7 @@ def _fit_structure(
 
     def rise(step: FloatArray) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
-            error = whitened(_response(omega, found.x + step, sign, integrating) - measured)
+            error = whiten(_response(omega, found.x + step, sign, integrating) - measured)
             return float(error @ error) - chi_square
 
     covariance = excess * _as_far_as_it_rises(inverse_in_any_units(found.jac.T @ found.jac), rise)

@@ -35,7 +35,7 @@ def is_simple_test(u: FloatArray) -> bool:
     return bool(np.mean(bends) < 1.0 - _STRAIGHT)
 
 
-def explained_by_plant(recording: Recording) -> float:
+def plant_evidence(recording: Recording) -> float:
     """Return twice the logarithm of the likelihood that a plant's answer to u is worth beside coloured noise alone.
 
     Parameters
@@ -55,11 +55,11 @@ def explained_by_plant(recording: Recording) -> float:
             data = prepare(recording).usable_from(model.delay_s)
         except AutotuneError:
             continue
-        best = max(best, _gained(data, model, Structure(order=order, integrator=integrator)))
+        best = max(best, _gain_in_likelihood(data, model, Structure(order=order, integrator=integrator)))
     return best
 
 
-def _gained(data: DelayData, model: DelayModel, structure: Structure) -> float:
+def _gain_in_likelihood(data: DelayData, model: DelayModel, structure: Structure) -> float:
     with_u = residuals(data, solve_linear(data, structure, model.a, model.delay_s))
     t = data.ty - data.ty[0]
     modes = [np.ones_like(t)]

@@ -22,7 +22,7 @@ from autotune.errors import AutotuneError, IdentificationError
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.dependence import is_fed_back
-from autotune.identification.equation_region import LEAST_SHARE, Equation, joined, largest_term
+from autotune.identification.equation_region import LEAST_SHARE, Equation, join_fits, largest_term
 from autotune.identification.parametric import EXCLUDED, PlantFit, not_excluded
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
@@ -229,4 +229,4 @@ def _with_zero(recordings: Sequence[Recording], found: _Fitted, rows: Sequence[i
 def _join(found: _Fitted, common: Sequence[int], unit: int | None = None) -> PlantFit:
     """Return the fit of one structure to all recordings."""
     equations = [Equation.of(model, found.structure.integrator) for model in found.models]
-    return joined(equations, unit, found.coefficients, found.criterion(common))
+    return join_fits(equations, unit, found.coefficients, found.criterion(common))

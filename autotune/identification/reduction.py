@@ -250,7 +250,7 @@ def _reduce(
     if conditions == "estimates":
         return known, _by_conditions(known, gain), ()
     # the structure chosen for the fit is itself uncertain: each point's own region stands beside the band
-    both = envelope_of_points(points, fit.sign, _PROBABILITY).joined(known)
+    both = envelope_of_points(points, fit.sign, _PROBABILITY).join_with(known)
     try:
         return both, _by_conditions(both, gain, static_gain_known=False), ()
     except IdentificationError:

@@ -112,15 +112,15 @@ def judge_equation(
     gram = white.T @ white
     of = np.concatenate([np.full(len(gram) - 1 - kinds.size, -1), kinds])
 
-    def explained(*which: int) -> tuple[float, int]:
+    def explain(*which: int) -> tuple[float, int]:
         kept = np.flatnonzero(np.isin(of, (-1, *which)))
         _, squares, rank = _least_squares(gram[np.ix_(kept, kept)], gram[kept, -1])
         return squares, rank
 
-    (by_model, rank), (by_all, full) = explained(), explained(*range(len(TESTS)))
+    (by_model, rank), (by_all, full) = explain(), explain(*range(len(TESTS)))
     freedom = len(white) - full
     variance = (float(gram[-1, -1]) - by_all) / freedom
-    each = [explained(kind) for kind in range(len(TESTS))]
+    each = [explain(kind) for kind in range(len(TESTS))]
     ratios = [(squares - by_model) / max(more - rank, 1) / variance for squares, more in each]
     p = [f_tail(ratio, max(more - rank, 1), freedom) for ratio, (_, more) in zip(ratios, each, strict=True)]
     return (p[0], p[1], p[2]), max(1.0, ratios[0])

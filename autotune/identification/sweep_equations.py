@@ -118,7 +118,7 @@ def fit_from_points(points: Sequence[FrequencyPoint], data: DelayData, largest: 
         places += [place for one in found for place in _grow_places(one, structure, omega)]
         begun = min((solve_linear(data, structure, *place) for place in places), key=lambda point: point.cost)
         found += _fit_structure(data, structure, begun, len(places), largest, np.empty(0))
-    return _determined(found, data)
+    return _drop_undetermined(found, data)
 
 
 def _grow_places(one: Fitted, structure: Structure, omega: FloatArray) -> list[tuple[tuple[float, ...], float]]:
@@ -179,10 +179,10 @@ def fit_again(data: DelayData, found: Sequence[Fitted], largest: float, whitenin
     for one in found:
         begun = solve_linear(data, one.structure, one.point.a, one.point.h, whitening)
         again += _fit_structure(data, one.structure, begun, one.places, largest, whitening)
-    return _determined(again, data)
+    return _drop_undetermined(again, data)
 
 
-def _determined(found: list[Fitted], data: DelayData) -> list[Fitted]:
+def _drop_undetermined(found: list[Fitted], data: DelayData) -> list[Fitted]:
     if not found:
         raise IdentificationError("no equation is determined by the rows of the sweep", where=data.name)
     return found

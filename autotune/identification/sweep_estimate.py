@@ -139,7 +139,7 @@ def estimate_sweep(
     )
     fit = plant_fit([one.equation for one in found])
     widened = replace(
-        fit, covariance=excess * fit.covariance, source="points", shared_errors=_shared_errors(covariance)
+        fit, covariance=excess * fit.covariance, source="points", shared_errors=_shared_error_factor(covariance)
     )
     return SweepEstimate(points=points, fit=widened, p_values=p_values, start_s=start_s, end_s=end_s)
 
@@ -169,7 +169,7 @@ def _average(found: Sequence[Fitted], omega_rad_s: FloatArray) -> tuple[ComplexA
     return mean, covariance
 
 
-def _shared_errors(covariance: FloatArray) -> float:
+def _shared_error_factor(covariance: FloatArray) -> float:
     """Return by how much the points' covariances are to be multiplied for their joint region of independent errors.
 
     Their sum of squares has the mean of independent ones and a larger spread: a scaled chi-square of the same mean and

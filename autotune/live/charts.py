@@ -22,7 +22,7 @@ from autotune.report.figures import (
     region,
     usual_range,
 )
-from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, thinned
+from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, thin_curve
 
 #: regions of the points are drawn so many times larger, in every direction, where they would be too small to see
 MAGNIFIED = 10.0
@@ -239,7 +239,7 @@ def _line(
     width: float = 1.4, step: bool = False,
 ) -> Options:  # fmt: skip
     if x.size > ROWS:
-        x, y = thinned(x, y, ROWS)
+        x, y = thin_curve(x, y, ROWS)
     line: Options = {
         "name": name,
         "type": "line",

@@ -208,7 +208,7 @@ class Screen:
     def _show_words(self) -> None:
         story, controls = self._story, self._controls
         self._title.text = story.config.name if story.config is not None else "waiting for a run"
-        self._state.text, self._left.text = self._state_text(), self._left_text()
+        self._state.text, self._left.text = self._state_text(), self._remaining_text()
         self._relay.text, self._limits.text = story.relay_text(), story.limits_text()
         warnings = [*story.warnings(), *self._silence()]
         self._warnings.text = "\n".join(warnings)
@@ -232,7 +232,7 @@ class Screen:
             return "The rig holds the new gains. Keep them, or restore the old ones?"
         return f"{story.state.capitalize()}: {story.message}"
 
-    def _left_text(self) -> str:
+    def _remaining_text(self) -> str:
         story = self._story
         if story.ended is not None:
             return f"{story.now_s:.0f} s on the rig"

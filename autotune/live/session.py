@@ -28,7 +28,7 @@ from autotune.text_files import read_text
 ACTIONS = ("abort", "keep", "restore")
 
 
-def given_token(file: Path | None) -> str | None:
+def read_token(file: Path | None) -> str | None:
     """Return the word that visitors need, from a file or the environment, None where neither has one.
 
     Never from the command line, which every user of the machine can read.

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from autotune.pipeline.analysis import Analysis, analyse
 from autotune.pipeline.folder import CONTROLLER, JOURNAL, PROGRESS, RECORDING, RESULT, VERIFICATION, recordings
-from autotune.pipeline.measured import Measured, measured_of
+from autotune.pipeline.measured import Measured, measure_plant
 from autotune.pipeline.result import analysis_json, write_result
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ __all__ = [
     "analyse",
     "analysis_json",
     "hand_over",
-    "measured_of",
+    "measure_plant",
     "recordings",
     "tune",
     "write_result",

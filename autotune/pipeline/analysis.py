@@ -373,7 +373,7 @@ def _on_structures(
     return (on_plants(worst, controller, asked, "the plants of low order through the points"),)
 
 
-def looked_at(analysis: Analysis, controller: PIDController) -> tuple[Check, ...]:
+def check_controller(analysis: Analysis, controller: PIDController) -> tuple[Check, ...]:
     """Return the checks of another controller than the designed one, as of gains that a rig rounds.
 
     Parameters

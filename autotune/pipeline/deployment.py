@@ -16,7 +16,7 @@ from autotune.experiment.leaving import leave, say
 from autotune.experiment.rig import HoldsGains, RoundsGains, RunsOwnController, TrialGains
 from autotune.interrupts import interrupt_deferred
 from autotune.pipeline.audit import AuditLog
-from autotune.pipeline.held_gains import held_by
+from autotune.pipeline.held_gains import round_to_rig
 from autotune.pipeline.journal import Journal, Step
 
 
@@ -177,7 +177,7 @@ def deploy(
 
 def _as_held(rig: HoldsGains, controller: PIDController, old: PIDController) -> PIDController:
     """Return what the rig's own controller computes with the new gains: they rounded, its set-point weight its own."""
-    held = held_by(rig, controller, DesignSettings())
+    held = round_to_rig(rig, controller, DesignSettings())
     has_weight_of_its_own = isinstance(rig, RoundsGains) and not rig.takes_weight
     return replace(held, setpoint_weight=old.setpoint_weight) if has_weight_of_its_own else held
 
@@ -309,7 +309,7 @@ def _write(
     InputError
         The rig's registers cannot hold them, or only far from what they are; nothing was written.
     """
-    new = held_by(rig, new, DesignSettings())
+    new = round_to_rig(rig, new, DesignSettings())
     notes.note(Step.WRITING, new, why)
     try:
         try:

@@ -35,7 +35,7 @@ _OF_GAINS = tuple(
 EXPERIMENT_SECTIONS = ("rig", "signals", "limits", "operating_point", "experiment")
 
 
-def numbered(path: Path) -> Iterator[Path]:
+def numbered_paths(path: Path) -> Iterator[Path]:
     """Yield NAME.csv, NAME-2.csv, NAME-3.csv, ..."""
     yield path
     for number in count(2):
@@ -53,7 +53,9 @@ def next_free(path: Path, *suffixes: str) -> Path:
         Endings of the files beside it.
     """
     return next(
-        each for each in numbered(path) if not any(one.exists() for one in (each, *map(each.with_suffix, suffixes)))
+        each
+        for each in numbered_paths(path)
+        if not any(one.exists() for one in (each, *map(each.with_suffix, suffixes)))
     )
 
 
@@ -67,7 +69,7 @@ def recordings(folder: Path, name: str = RECORDING) -> tuple[Path, ...]:
     name : str
         Of the first of them.
     """
-    return tuple(takewhile(Path.exists, numbered(folder / name)))
+    return tuple(takewhile(Path.exists, numbered_paths(folder / name)))
 
 
 def store_config(config: Config, folder: Path) -> None:
@@ -117,7 +119,7 @@ def _stores(config: Config, place: Path) -> bool:
         return False
 
 
-def stored_config(folder: Path) -> Config:
+def read_stored_config(folder: Path) -> Config:
     """Return the configuration that the run in the folder began with.
 
     Raises
@@ -180,7 +182,7 @@ def read_interrupted(folder: Path, config: Config) -> Earlier:
     """
     from autotune.experiment.cycles import read_earlier
 
-    different = differences(stored_config(folder), config)
+    different = differences(read_stored_config(folder), config)
     if different:
         raise InputError(
             f"the configuration is not the one that the run began with: {'; '.join(different)}",

@@ -12,7 +12,7 @@ from autotune.design.nugap import loop_scaling, validate
 from autotune.errors import InputError
 from autotune.experiment.rig import Rig, RoundsGains
 from autotune.identification.parametric import PlantFit
-from autotune.pipeline.analysis import Analysis, looked_at
+from autotune.pipeline.analysis import Analysis, check_controller
 
 #: largest relative change of a gain by rounding; a fifth of the gain is a fifth of the disturbance's area
 MOVED = 0.2
@@ -20,7 +20,7 @@ MOVED = 0.2
 KEPT = 0.95
 
 
-def held_by(
+def round_to_rig(
     rig: Rig, controller: PIDController, settings: DesignSettings, *, fit: PlantFit | None = None
 ) -> PIDController:
     """Return the controller that the rig would hold after these gains were written; nothing is written.
@@ -86,7 +86,7 @@ def on_registers(analysis: Analysis, held: PIDController) -> Analysis:
             certificate="; ".join(part for part in (analysis.design.certificate, said) if part),
         ),
         margins=margins(plant, held),
-        checks=looked_at(analysis, held),
+        checks=check_controller(analysis, held),
         unscaled=None if H_r is None else validate(plant, H_r, held),
         scaled=None if H_r is None else validate(plant, H_r, held, scaling=loop_scaling(H_r, held)),
     )

@@ -17,7 +17,7 @@ from autotune.experiment.rig import Rig
 from autotune.experiment.run import OnStatus
 from autotune.experiment_design.conditions import conditions_of
 from autotune.experiment_design.next_experiment import with_next_experiment
-from autotune.experiment_design.open_hypotheses import decided, open_hypotheses
+from autotune.experiment_design.open_hypotheses import only_hypothesis, open_hypotheses
 from autotune.experiment_design.plan import Plan, general, plan_in
 from autotune.models import Model
 from autotune.progress import Progress, quiet
@@ -230,7 +230,7 @@ def _next(
     if found is None:
         first = general(assemble(model), conditions_of(config), duration_s)
         return Plan(excitation=first, between=(), discrimination=0.0), ""
-    hypotheses, best = open_hypotheses(found), decided(found)
+    hypotheses, best = open_hypotheses(found), only_hypothesis(found)
     if best == "none":
         return None, "the simulation explains the recordings"
     if best or len(hypotheses) < 2:

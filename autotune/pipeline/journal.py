@@ -10,7 +10,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
-from autotune.controller import PIDController, held_from_table
+from autotune.controller import PIDController, read_noted_gains
 from autotune.errors import ExperimentStopped, InputError
 from autotune.pipeline.audit import AuditLog
 from autotune.text_files import read_text
@@ -104,7 +104,7 @@ class Journal:
         gains = next((gains for step, gains in reversed(notes) if step is Step.READ), None)
         if gains is None:
             raise self._no_journal("its end is open and no gains were read before")
-        return held_from_table(gains, str(self.path))
+        return read_noted_gains(gains, str(self.path))
 
     def _notes(self) -> list[tuple[Step, dict[str, Any]]]:
         """Return the steps with their gains; a line without its end was cut off before its step was taken."""

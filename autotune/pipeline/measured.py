@@ -12,7 +12,7 @@ from autotune.errors import AutotuneError
 from autotune.identification.dependence import require_answer
 from autotune.identification.frequency.recorded import combine, session_points, sessions
 from autotune.identification.frequency.spectral_points import FrequencyEstimate
-from autotune.identification.frequency.windows import noted_windows
+from autotune.identification.frequency.windows import read_noted_windows
 from autotune.identification.parametric import PlantFit
 from autotune.identification.recorded_plant import fit_recordings
 from autotune.pipeline.one_thread import on_one_thread
@@ -49,7 +49,7 @@ class Measured:
 
 
 @on_one_thread
-def measured_of(
+def measure_plant(
     recordings: Sequence[Recording], given: Sequence[FrequencyPoint] = (), progress: Progress = quiet
 ) -> Measured:
     """Return what recordings and given points say about their plant.
@@ -69,7 +69,7 @@ def measured_of(
         y does not answer u beyond chance, or neither points nor a fit can be had of them.
     """
     # an experiment that noted its limit cycles has seen y answer, and few of them say little of it
-    plain = [one for one in recordings if not noted_windows(one)]
+    plain = [one for one in recordings if not read_noted_windows(one)]
     if plain:
         progress("asking whether y answers u", 0.0)
         require_answer(plain)
@@ -102,7 +102,7 @@ def measured_of(
 
 def _from_first_cycle(recording: Recording) -> Recording:
     """Return the rows from the first noted limit cycle on: before it the plant was brought from rest."""
-    windows = noted_windows(recording)
+    windows = read_noted_windows(recording)
     return recording.between(windows[0].window.start_s, float(recording.t[-1])) if windows else recording
 
 

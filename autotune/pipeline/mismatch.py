@@ -22,7 +22,7 @@ from autotune.progress import Progress
 from autotune.recording import Recording, read_recording
 
 
-def fitted_model(config: Config, fit: PlantFit, u_rest: float) -> Model:
+def model_of_fit(config: Config, fit: PlantFit, u_rest: float) -> Model:
     """Return the plant fitted to the points as a chain around the operating point.
 
     Parameters
@@ -108,4 +108,4 @@ def diagnose_run(
     read = [around_operating_point(read_recording(path)) for path in files]
     rows = [one for one in read if one is not None]
     u_rest = resting_command(rows[0], fit.plant, experiment.u_rest, config.operating_point.y)
-    return with_next_experiment(diagnose(fitted_model(config, fit, u_rest), rows, progress=progress))
+    return with_next_experiment(diagnose(model_of_fit(config, fit, u_rest), rows, progress=progress))

@@ -33,7 +33,7 @@ from autotune.pipeline.folder import (
     read_interrupted,
     store_config,
 )
-from autotune.pipeline.held_gains import held_by, on_registers
+from autotune.pipeline.held_gains import on_registers, round_to_rig
 from autotune.pipeline.result import write_result
 from autotune.pipeline.swept import analyse_sweep, facts_of, price_of
 from autotune.run_log import RunLog
@@ -158,10 +158,10 @@ def _tune(
             _teller(on_status, experiment.rig_time_s),
         )
         if deploy:  # what the rig can hold is what is verified, reported and handed over
-            held = held_by(rig, analysis.controller, config.design, fit=analysis.fit)
+            held = round_to_rig(rig, analysis.controller, config.design, fit=analysis.fit)
             analysis = on_registers(analysis, held)
         reduced = None if analysis.reduced is None else analysis.reduced.transfer_function()
-        log.analysed(analysis.points, analysis.fit.plant, reduced, analysis.controller)
+        log.say_analysis(analysis.points, analysis.fit.plant, reduced, analysis.controller)
         handed = _hand_over(
             rig, config, analysis, experiment, out, log, verify=verify, deploy=deploy, on_status=on_status
         )
@@ -230,7 +230,7 @@ def _hand_over(
             gains=gains,
             on_status=on_status,
         )
-        log.verified(found)
+        log.say_verification(found)
         return found
 
     if verify and deploy and isinstance(rig, RunsOwnController) and not rig.not_startable:

@@ -16,7 +16,7 @@ from autotune.design.margins import margins
 from autotune.design.nugap import Validation
 from autotune.identification.parametric import PlantFit
 from autotune.pipeline import Analysis
-from autotune.report.analysis_words import based_on, with_units
+from autotune.report.analysis_words import basis_text, with_units
 from autotune.report.figures import Curve, ratio_title
 from autotune.report.loop_diagrams import nichols_figure, nyquist_figure, sensitivity_figure
 from autotune.report.maker_forms import maker_table
@@ -239,7 +239,8 @@ def _outside(analysis: Analysis) -> str:
         return "the loop stays outside the circle of the modulus margin"
     if modulus > asked * (1.0 - _DRAWN):
         return "the loops stay outside the circle of the modulus margin"
-    words = f"the plant's loop stays outside the circle of the modulus margin; the controller was {based_on(analysis)}"
+    basis = basis_text(analysis)
+    words = f"the plant's loop stays outside the circle of the modulus margin; the controller was {basis}"
     if modulus > 0.0:
         return f"{words}; the reduced model, which is more cautious, enters it (modulus margin {modulus:.2f})"
     return (

@@ -47,7 +47,7 @@ def designed_text(design: Design, signals: SignalSettings) -> str:
     return f"I controller with K_I = {c.K / c.Ti_s:.4g}{unit} (where only a PI is at hand: {words})"
 
 
-def based_on(analysis: Analysis) -> str:
+def basis_text(analysis: Analysis) -> str:
     """Return in words what the controller was designed on."""
     count = f"{len(analysis.points)} points"
     if analysis.source == "points":

@@ -12,7 +12,7 @@ from autotune.diagnosis.evidence.unseen_run import UnseenRun
 from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment
 from autotune.diagnosis.verdict import OFFSET
 from autotune.effects import kind_of
-from autotune.report.effect_words import clause, in_short, joined, of_candidate, sentence, unit_of, with_spread
+from autotune.report.effect_words import clause, in_short, join_clauses, of_candidate, sentence, unit_of, with_spread
 
 #: Probability from which a statement is called sure, likely, and what is below that a guess.
 _SURE, _LIKELY = 0.9, 0.6
@@ -24,7 +24,7 @@ def verdict_of(found: Diagnosis) -> str:
     """Return the verdict in a sentence, effects in words with their names in brackets."""
     if found.verdict != "effect" or not found.effects:
         return found.sentences[0]
-    said = joined([f"{clause(e.name)} ({_name_of(e)}, probability {e.probability:.2f})" for e in found.effects])
+    said = join_clauses([f"{clause(e.name)} ({_name_of(e)}, probability {e.probability:.2f})" for e in found.effects])
     rest = "" if found.is_clean else " Something smaller is missing as well: what is left is not noise."
     return f"The model leaves physics out: {said}.{rest}"
 
@@ -65,7 +65,8 @@ def _finding_text(found: Diagnosis) -> str:
             "none": "Nothing: neither the structure nor the numbers need a change.",
             "parameters": "Other numbers, no other structure: they are below, by block.",
         }.get(
-            found.verdict, f"Something at the {joined(list(found.places))} that no effect of the catalogue describes."
+            found.verdict,
+            f"Something at the {join_clauses(list(found.places))} that no effect of the catalogue describes.",
         )
     said = []
     for effect in found.effects:
@@ -160,7 +161,7 @@ def in_the_model(found: Diagnosis) -> str:
         return ""
     if not more:
         return ""
-    said = joined([f"{clause(name)} ({name})" for name in more])
+    said = join_clauses([f"{clause(name)} ({name})" for name in more])
     return (
         f"The extended model has, beyond what is named: {said}. It stands there because it predicts unseen rows "
         "better, or was in the given model; it is not a finding."
@@ -203,7 +204,7 @@ def _ranges(found: Diagnosis) -> list[str]:
             seen.setdefault((r.signal, r.low, r.high, r.unit), []).append(in_short(effect.name))
     from_rest = {"plant input": " from the operating point", "position": " from the operating point"}
     return [
-        f"{joined(names).capitalize()}: seen for {signal}{from_rest.get(signal, '')} "
+        f"{join_clauses(names).capitalize()}: seen for {signal}{from_rest.get(signal, '')} "
         f"between {low:.4g} and {high:.4g}{unit_of(unit)}; beyond that nothing was excited."
         for (signal, low, high, unit), names in seen.items()
     ]
@@ -250,8 +251,8 @@ def _bins(laws: Sequence[MissingLaw]) -> list[str]:
 def _of_effect(effect: FoundEffect) -> list[str]:
     kind, said = kind_of(effect.name), []
     if kind.same:
-        said.append(f"Command and reading alone cannot tell {effect.name} from {joined(list(kind.same))}.")
+        said.append(f"Command and reading alone cannot tell {effect.name} from {join_clauses(list(kind.same))}.")
     unfelt = [key.replace("_", " ") for key, p in effect.parameters.items() if not math.isfinite(p.sd)]
     if unfelt and kind.is_simulated:
-        said.append(f"The recordings do not say how exact {joined(unfelt)} of {in_short(effect.name)} is.")
+        said.append(f"The recordings do not say how exact {join_clauses(unfelt)} of {in_short(effect.name)} is.")
     return said

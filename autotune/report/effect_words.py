@@ -19,7 +19,7 @@ def clause(name: str) -> str:
     return KINDS[name].words[1] if name in KINDS else f"there is {in_short(name)}"
 
 
-def joined(clauses: list[str]) -> str:
+def join_clauses(clauses: list[str]) -> str:
     """Return clauses as one: commas, and ``and`` before the last."""
     if len(clauses) < 2:
         return "".join(clauses)
@@ -81,7 +81,7 @@ def of_candidate(name: str, *, beside: bool = False) -> str:
     if name in ("none", "unknown"):
         none = "nothing else is missing" if beside else "nothing is missing"
         return {"none": none, "unknown": "a cause outside the catalogue"}[name]
-    return joined([clause(one) for one in name.split("+")]) + f" ({name.replace('+', ' + ')})"
+    return join_clauses([clause(one) for one in name.split("+")]) + f" ({name.replace('+', ' + ')})"
 
 
 def of_candidates(candidates: Sequence[tuple[str, float]], verdict: str) -> list[tuple[str, float]]:

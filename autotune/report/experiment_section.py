@@ -17,7 +17,7 @@ from autotune.recording import Recording
 from autotune.report.chart import Chart, make_subplots
 from autotune.report.effect_words import number
 from autotune.report.figures import axis_title, recording_figure
-from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Section, Table, add_line, thinned
+from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Section, Table, add_line, thin_curve
 
 
 def experiment_section(
@@ -129,8 +129,8 @@ def _cycles_figure(recordings: Sequence[Recording], segments: Sequence[Segment],
         t = (part.t - part.t[0]) / period
         name, colour = f"{segment.point.omega_rad_s:.3g} rad/s", _CYCLE_COLOURS[i % len(_CYCLE_COLOURS)]
         y = part.y - np.nanmean(part.y)
-        add_line(figure, *thinned(t, y, 600), name, colour, width=1.2, row=1, col=1)
-        add_line(figure, *thinned(t, part.u, 600), name, colour, width=1.2, row=2, col=1, line_shape="hv")
+        add_line(figure, *thin_curve(t, y, 600), name, colour, width=1.2, row=1, col=1)
+        add_line(figure, *thin_curve(t, part.u, 600), name, colour, width=1.2, row=2, col=1, line_shape="hv")
     figure.update_xaxes(title="periods", row=2, col=1)
     figure.update_yaxes(title=axis_title("y - mean", signals.y_unit), row=1, col=1)
     figure.update_yaxes(title=axis_title("u", signals.u_unit), row=2, col=1)

@@ -13,7 +13,7 @@ from autotune.points import FrequencyPoint
 from autotune.recording import Recording
 from autotune.report import chart as go
 from autotune.report.chart import make_subplots
-from autotune.report.page import BLUE, GREY, ORANGE, add_line, thinned
+from autotune.report.page import BLUE, GREY, ORANGE, add_line, thin_curve
 
 
 class Responds(Protocol):
@@ -49,10 +49,10 @@ def recording_figure(
         Vertical lines.
     """
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.62, 0.38])
-    add_line(figure, *thinned(recording.t, recording.y), "y", BLUE, width=1.0, row=1, col=1)
+    add_line(figure, *thin_curve(recording.t, recording.y), "y", BLUE, width=1.0, row=1, col=1)
     if "r" in recording.extra:
-        add_line(figure, *thinned(recording.t, recording["r"]), "r", GREY, dash="dash", row=1, col=1)
-    held_t, held_u = thinned(recording.t, recording.u)
+        add_line(figure, *thin_curve(recording.t, recording["r"]), "r", GREY, dash="dash", row=1, col=1)
+    held_t, held_u = thin_curve(recording.t, recording.u)
     add_line(figure, held_t, held_u, "u", ORANGE, width=1.0, row=2, col=1, line_shape="hv")
     figure.update_yaxes(title=axis_title("y", y_unit), row=1, col=1)
     figure.update_yaxes(title=axis_title("u", u_unit), range=usual_range(recording.u), row=2, col=1)

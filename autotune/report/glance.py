@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 
 from autotune.batch.row import ATTENTION, Attention, Row
-from autotune.text_files import shown
+from autotune.text_files import escape_controls
 
 #: Fewer loops are seen at a glance in the tables.
 FEWEST = 13
@@ -58,11 +58,11 @@ def _urgency(rows: Sequence[Row]) -> float:
 
 def _group(area: str, rows: Sequence[Row], colours: Mapping[Attention, str], *, named: bool) -> str:
     squares = "".join(
-        f'<a href="#{identity(row)}" title="{html.escape(shown(_words(row)))}"'
+        f'<a href="#{identity(row)}" title="{html.escape(escape_controls(_words(row)))}"'
         f' style="background:{colours[row.attention]}"></a>'
         for row in sorted(rows, key=lambda row: row.order)
     )
-    name = f"<h3>{html.escape(shown(area)) or 'no area'} ({len(rows)})</h3>" if named else ""
+    name = f"<h3>{html.escape(escape_controls(area)) or 'no area'} ({len(rows)})</h3>" if named else ""
     return f"<section>{name}<div>{squares}</div></section>"
 
 

@@ -16,7 +16,7 @@ from autotune.recording import Recording
 from autotune.report import chart as go
 from autotune.report.chart import make_subplots
 from autotune.report.effect_words import clause, sentence
-from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, Figure, add_line, lines_figure, thinned
+from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, Figure, add_line, lines_figure, thin_curve
 
 _COLOURS = {"nominal": PURPLE, "retuned": ORANGE, "extended": BLUE}
 _DASHES = {"nominal": "dot", "retuned": "dash", "extended": "solid"}
@@ -50,12 +50,12 @@ def free_run_figure(run: UnseenRun, name: str) -> Figure:
         Of its recording.
     """
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=[0.66, 0.34])
-    add_line(figure, *thinned(run.t, run.y), "measured", GREY, width=2.4, row=1, col=1)
+    add_line(figure, *thin_curve(run.t, run.y), "measured", GREY, width=2.4, row=1, col=1)
     shown: list[FloatArray] = []
     for model, y in run.runs.items():
-        add_line(figure, *thinned(run.t, y), model, _COLOURS[model], dash=_DASHES[model], row=1, col=1)
+        add_line(figure, *thin_curve(run.t, y), model, _COLOURS[model], dash=_DASHES[model], row=1, col=1)
         add_line(
-            figure, *thinned(run.t, run.y - y), model, _COLOURS[model], dash=_DASHES[model], row=2, col=1,
+            figure, *thin_curve(run.t, run.y - y), model, _COLOURS[model], dash=_DASHES[model], row=2, col=1,
             showlegend=False,
         )  # fmt: skip
         if model != "nominal" or len(run.runs) < 3:
@@ -160,7 +160,7 @@ def acting_figure(law: MissingLaw, recordings: Sequence[Recording], names: Seque
         # where windows begin, a speed may be far off for a row or two
         add_line(
             figure,
-            *thinned(at + r.t[rows] - r.t[0], median_filter(added, 5, mode="nearest")),
+            *thin_curve(at + r.t[rows] - r.t[0], median_filter(added, 5, mode="nearest")),
             "",
             BLUE,
             width=1.2,

@@ -18,7 +18,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.report.chart import Chart, Scatter
 from autotune.report.page_shell import CHARTS, SHELL, TABLES
-from autotune.text_files import shown
+from autotune.text_files import escape_controls
 from autotune.whole_files import write_whole
 
 Tone: TypeAlias = Literal["good", "warn", "bad"]
@@ -129,7 +129,7 @@ class Page:
     sections: tuple[Section, ...] = ()
 
 
-def thinned(t: FloatArray, y: FloatArray, points: int = 3000) -> tuple[FloatArray, FloatArray]:
+def thin_curve(t: FloatArray, y: FloatArray, points: int = 3000) -> tuple[FloatArray, FloatArray]:
     """Return at most about ``points`` rows that draw the same curve: the extremes of every bin are kept.
 
     Parameters
@@ -246,7 +246,7 @@ def _answers(answers: tuple[tuple[str, str], ...]) -> str:
 
 
 def _text(text: str) -> str:
-    return html.escape(shown(text), quote=False)
+    return html.escape(escape_controls(text), quote=False)
 
 
 def _section(section: Section, number: int) -> str:

@@ -15,7 +15,7 @@ from autotune.recording import Recording
 from autotune.report.chart import Chart
 from autotune.report.figures import ratio_title, recording_figure
 from autotune.report.free_run import forecast, free_run, share_explained
-from autotune.report.page import GREEN, RED, Figure, Table, add_line, thinned
+from autotune.report.page import GREEN, RED, Figure, Table, add_line, thin_curve
 
 #: Plants that are drawn from the region for the intervals.
 DRAWS = 200
@@ -45,7 +45,7 @@ def model_figures(fit: PlantFit, recordings: Sequence[Recording], signals: Signa
         if simulated is None:
             continue
         chart = recording_figure(recording, signals.u_unit, signals.y_unit)
-        add_line(chart, *thinned(recording.t, simulated), "fitted plant", GREEN, width=1.6, row=1, col=1)
+        add_line(chart, *thin_curve(recording.t, simulated), "fitted plant", GREEN, width=1.6, row=1, col=1)
         own = "the rows that it was fitted to" if fit.source == "recording" else "rows that its points came from"
         percent = share_explained(recording, simulated)
         caption = f"{recording.name}: the fitted plant runs freely over {own}, and explains {percent:.0f} % of y."
@@ -60,7 +60,7 @@ def _forecast_of(fit: PlantFit, recording: Recording, chart: Chart, signals: Sig
     found = forecast(fit, recording)
     if found is None:
         return ""
-    t, y = thinned(recording.t[found.first :], found.y[found.first :])
+    t, y = thin_curve(recording.t[found.first :], found.y[found.first :])
     add_line(chart, t, y, "forecast of unseen rows", RED, dash="dash", row=1, col=1)
     errors = (f"{value:.2g} {signals.y_unit}".strip() for value in (found.unseen, found.seen))
     return (

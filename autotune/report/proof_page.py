@@ -67,7 +67,7 @@ def proof_page(
             Section(title="Figures", tables=(_figures(rows),)),
             *further,
             *_calibration(result["marks"], interval),
-            Section(title=f"Missed cases ({len(missed)})", tables=(_missed_table(missed),) if missed else ()),
+            Section(title=f"Missed cases ({len(missed)})", tables=(_missed_cases_table(missed),) if missed else ()),
             Section(title="What was said of what", tables=(_confusion(confusion),)),
         ),
     )
@@ -122,7 +122,7 @@ def _calibration(marks: Sequence[Content], interval: Interval) -> tuple[Section,
     )
 
 
-def _missed_table(missed: Sequence[Content]) -> Table:
+def _missed_cases_table(missed: Sequence[Content]) -> Table:
     rows = tuple(
         (
             mark["case"],

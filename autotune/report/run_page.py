@@ -69,7 +69,7 @@ def run_page(
     )
 
 
-def stopped_page(name: str, signals: SignalSettings, recordings: Sequence[Recording], line: str) -> Page:
+def stopped_run_page(name: str, signals: SignalSettings, recordings: Sequence[Recording], line: str) -> Page:
     """Return the page of a run that a limit, a fault or the operator stopped: why, and how the rig was left.
 
     Parameters

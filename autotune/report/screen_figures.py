@@ -28,7 +28,7 @@ from autotune.diagnosis.evidence.screens import (
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.searched import Search
 from autotune.report import chart as go
-from autotune.report.page import BLUE, GREEN, GREY, ORANGE, Figure, Section, Table, add_line, lines_figure, thinned
+from autotune.report.page import BLUE, GREEN, GREY, ORANGE, Figure, Section, Table, add_line, lines_figure, thin_curve
 
 #: Height of one screen's picture [px]; periods of the recomputed law that are drawn.
 HEIGHT, LAW_ROWS = 300, 600
@@ -264,9 +264,9 @@ def trace_figures(found: Diagnosis, names: Sequence[str]) -> tuple[Figure, ...]:
     figures, search = [], found.search
     for i, (r, name, count) in enumerate(zip(search.recordings, names, search.runs(), strict=True)):
         figure = lines_figure("time [s]", f"y [{search.units[1]}]")
-        add_line(figure, *thinned(r.t, r.y), "measured", GREY, width=1.0)
+        add_line(figure, *thin_curve(r.t, r.y), "measured", GREY, width=1.0)
         for model, simulated in search.simulated().items():
-            add_line(figure, *thinned(r.t, simulated[i]), model, {"retuned": ORANGE, "extended": BLUE}[model])
+            add_line(figure, *thin_curve(r.t, simulated[i]), model, {"retuned": ORANGE, "extended": BLUE}[model])
         how = "in one run" if count == 1 else f"in {count} windows, the state fitted at the start of each"
         figures.append(Figure(figure=figure, caption=f"{name}: measured, and simulated {how}.", height_px=HEIGHT))
     return tuple(figures)

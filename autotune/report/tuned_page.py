@@ -10,7 +10,7 @@ from autotune.controller import PIDController
 from autotune.pipeline import Analysis
 from autotune.recording import Recording
 from autotune.report.analysis_sections import analysis_sections, warnings_sections
-from autotune.report.analysis_words import based_on, designed_text, margins_sentence
+from autotune.report.analysis_words import basis_text, designed_text, margins_sentence
 from autotune.report.figures import recording_figure
 from autotune.report.outlook import outlook_section
 from autotune.report.page import Figure, Page, Section
@@ -65,7 +65,7 @@ def analysis_page(
         verdict=f"{designed_text(analysis.design, signals)}: not yet tried on the rig.",
         tone="warn",
         answers=(
-            ("Found", f"{designed_text(analysis.design, signals)}, {based_on(analysis)}."),
+            ("Found", f"{designed_text(analysis.design, signals)}, {basis_text(analysis)}."),
             ("How sure", margins_sentence(analysis, signals)),
             (
                 "What to do",

@@ -7,12 +7,12 @@ import math
 import numpy as np
 
 from autotune.config.procedure import SignalSettings
-from autotune.experiment.judgement import Verification, smoothed
+from autotune.experiment.judgement import Verification, smooth_steps
 from autotune.experiment.step_test import StepTest
 from autotune.report.chart import Chart, make_subplots
 from autotune.report.effect_words import sentence
 from autotune.report.figures import axis_title, ratio_title
-from autotune.report.page import BLUE, GREEN, GREY, ORANGE, RED, Figure, Section, Table, add_line, thinned
+from autotune.report.page import BLUE, GREEN, GREY, ORANGE, RED, Figure, Section, Table, add_line, thin_curve
 
 
 def verification_section(verification: Verification, signals: SignalSettings) -> Section:
@@ -93,16 +93,16 @@ def _step_figure(verification: Verification, signals: SignalSettings) -> Chart:
         figure, test.t[edge], prediction.high[edge], "95 % band", GREEN, width=0.4, row=1, col=1,
         fill="tonexty", fillcolor="rgba(13,154,114,0.18)",
     )  # fmt: skip
-    add_line(figure, *thinned(test.t, verification.y), "measured", "rgba(59,130,196,0.45)", width=0.8, row=1, col=1)
+    add_line(figure, *thin_curve(test.t, verification.y), "measured", "rgba(59,130,196,0.45)", width=0.8, row=1, col=1)
     usable = np.isfinite(verification.y)
     filled = np.interp(test.t, test.t[usable], verification.y[usable])
-    add_line(figure, *thinned(test.t, smoothed(filled, test)), "measured, smoothed", BLUE, row=1, col=1)
-    add_line(figure, *thinned(test.t, prediction.y), "predicted", RED, row=1, col=1)
+    add_line(figure, *thin_curve(test.t, smooth_steps(filled, test)), "measured, smoothed", BLUE, row=1, col=1)
+    add_line(figure, *thin_curve(test.t, prediction.y), "predicted", RED, row=1, col=1)
     add_line(figure, test.t[edge], test.setpoint[edge], "set-point", GREY, dash="dash", row=1, col=1)
     early = slice(0, max(test.disturbed_from // 10, 1))
     rest = float(np.median(verification.u[early] - prediction.u[early]))  # the command that holds the operating point
-    add_line(figure, *thinned(test.t, verification.u - rest), "u of the law", ORANGE, width=1.0, row=2, col=1)
-    add_line(figure, *thinned(test.t, prediction.u), "predicted u", RED, row=2, col=1, showlegend=False)
+    add_line(figure, *thin_curve(test.t, verification.u - rest), "u of the law", ORANGE, width=1.0, row=2, col=1)
+    add_line(figure, *thin_curve(test.t, prediction.u), "predicted u", RED, row=2, col=1, showlegend=False)
     figure.update_yaxes(title=axis_title("y - operating point", signals.y_unit), row=1, col=1)
     figure.update_yaxes(title=axis_title("Δu", signals.u_unit), row=2, col=1)
     figure.update_xaxes(title="time [s]", row=2, col=1)

@@ -12,7 +12,7 @@ import numpy as np
 from sim.conceal.draw import Draw, RejectedError, draw
 from sim.conceal.effects import PROCESS
 from sim.conceal.physics import Floats, Physics
-from sim.conceal.record import Record, record, scale_of, sized_effects
+from sim.conceal.record import Record, record, scale_of, size_effects
 from sim.conceal.retune import Chain, forecast_error, residuals, retune
 from sim.conceal.rigs import linear_truth, model_file
 from sim.conceal.sizes import Scale, Sized
@@ -27,7 +27,7 @@ ACTS_AT_TIMES = ("plant.hard_stop", "actuator.saturation")
 
 def _retuned_ratio(d: Draw, sizes: tuple[float, ...], scale: Scale) -> tuple[float, Chain]:
     """Rms residual of the retuned structure over the noise, and that structure."""
-    physics, made = sized_effects(d, sizes, scale)
+    physics, made = size_effects(d, sizes, scale)
     records = [record(d, which, physics, made) for which in (0, 1)]
     window = round(2.0 * d.rig.horizon / d.rig.Ts)
     chain, rms = retune(d.rig.chain, [(r.u, r.y) for r in records], d.rig.Ts, window, 2e-4)
@@ -108,7 +108,7 @@ def make(seed: int) -> tuple[Draw, list[Record], dict[str, Any]]:
         try:
             scale = scale_of(d)
             sizes = _sizes_for(d, scale)
-            physics, made = sized_effects(d, sizes, scale)
+            physics, made = size_effects(d, sizes, scale)
             records = [record(d, which, physics, made) for which in (0, 1, 2)]
             return d, records, _answer(d, records, physics, made)
         except RejectedError:

@@ -38,7 +38,7 @@ class Sampling(NamedTuple):
 
 
 @njit(cache=True)
-def interpolated(values: Floats, k: int, back: float) -> float:
+def interpolate(values: Floats, k: int, back: float) -> float:
     """Return a sequence some rows before row k, linear between rows.
 
     Parameters
@@ -78,9 +78,9 @@ def measure(k: int, clean: Floats, command: float, sampling: Sampling, last: flo
     """
     t = sampling.t[k]
     back = p.clock_error * max(t, 0.0) / sampling.Ts
-    y = interpolated(clean, k, back)
+    y = interpolate(clean, k, back)
     if p.echo_gain != 0.0:
-        y += p.echo_gain * interpolated(clean, k, back + p.echo_delay / sampling.Ts)
+        y += p.echo_gain * interpolate(clean, k, back + p.echo_delay / sampling.Ts)
     y += p.crosstalk * command
     y += p.sensor_second_order * y * y
     if y < p.sensor_fold:
@@ -176,7 +176,7 @@ def run_loop(
         end = sampling.t[k + 1] if k + 1 < N else t + Ts
         while t < end:
             while pending <= k and switch[pending] <= t + 1e-12:  # commands that have arrived by now
-                ramp[0], ramp[1], ramp[2] = _reached(t, ramp, p), effective[pending], t
+                ramp[0], ramp[1], ramp[2] = _reference_at(t, ramp, p), effective[pending], t
                 pending += 1
             until = min(end, switch[pending]) if pending <= k else end
             direction, mode = advance(t, until, h, state, ramp, direction, mode, p, work)
@@ -187,7 +187,7 @@ def run_loop(
 
 
 @njit(cache=True)
-def _reached(t: float, ramp: Floats, p: Physics) -> float:
+def _reference_at(t: float, ramp: Floats, p: Physics) -> float:
     if p.rate_limit == np.inf:
         return float(ramp[1])
     reach = p.rate_limit * (t - ramp[2])

@@ -97,7 +97,7 @@ def scale_of(d: Draw) -> Scale:
     )
 
 
-def sized_effects(d: Draw, sizes: tuple[float, ...], scale: Scale) -> tuple[Physics, tuple[Sized, ...]]:
+def size_effects(d: Draw, sizes: tuple[float, ...], scale: Scale) -> tuple[Physics, tuple[Sized, ...]]:
     """Physics with the effects in it at the given sizes.
 
     Parameters

@@ -291,7 +291,7 @@ def switching(a: float, p: Physics, s: Scale, rng: np.random.Generator) -> Sized
     return Sized(physics={"switching_gain": gain, "switching_period": period}, parameters=parameters)
 
 
-def modulated(name: str, top: float) -> Maker:
+def modulate(name: str, top: float) -> Maker:
     """Conceal a lag, delay or stiffness that swings slowly in time."""
 
     def make(a: float, p: Physics, s: Scale, rng: np.random.Generator) -> Sized:

@@ -49,7 +49,7 @@ class RecordedMark:
     not_counted: str
 
 
-def opened(folder: Path, out: Path, count: int | None, seed: int, tool: tuple[str, ...]) -> RecordedCampaign:
+def open_campaign(folder: Path, out: Path, count: int | None, seed: int, tool: tuple[str, ...]) -> RecordedCampaign:
     """Read the rigs and keep what they were beside the campaign.
 
     Parameters

@@ -81,7 +81,7 @@ def _pairs(records: Sequence[Record]) -> list[tuple[Floats, Floats]]:
     return [(r.u, r.y) for r in records]
 
 
-def changed(ready: Ready, put: Put, seed: int) -> tuple[list[Record], list[Record]]:
+def change_recordings(ready: Ready, put: Put, seed: int) -> tuple[list[Record], list[Record]]:
     """Return the recordings that the tool is given and those kept back, with the effect in them.
 
     Parameters
@@ -118,7 +118,7 @@ def ratio(ready: Ready, put: Put, seed: int) -> tuple[float, Floats]:
         Of what is random in it.
     """
     rig = ready.rig
-    given, _ = changed(ready, put, seed)
+    given, _ = change_recordings(ready, put, seed)
     numbers, rms = linear.retune(rig.chain, _pairs(given), rig.Ts, ready.window, ready.numbers)
     return rms / ready.noise, numbers
 
@@ -137,7 +137,7 @@ def _search_size(ready: Ready, effect: Effect, strength: str, seed: int) -> Put:
     for _ in range(TRIES):
         try:
             put = effect.make(size, ready.scale, np.random.default_rng([seed, 6]))
-            require_no_converter(ready.rig.every, [r for part in changed(ready, put, seed) for r in part])
+            require_no_converter(ready.rig.every, [r for part in change_recordings(ready, put, seed) for r in part])
             found, _ = ratio(ready, put, seed)
         except RefusedError as why:
             found, reason = np.inf, str(why)
@@ -208,7 +208,7 @@ def _make_case(
     ready: Ready, effect: Effect | None, strength: str | None, put: Put, seed: int, passed_over: list[str]
 ) -> Made:
     found, numbers = ratio(ready, put, seed)
-    given, kept_back = changed(ready, put, seed)
+    given, kept_back = change_recordings(ready, put, seed)
     return Made(
         ready=ready, effect=effect, strength=strength, put=put, ratio=found, numbers=numbers, given=given,
         kept_back=kept_back, passed_over=passed_over,

@@ -15,7 +15,7 @@ from sim.score import Mark, Row, calibration_error, wilson
 Hit = tuple[str, bool]
 
 
-def clustered(hits: Sequence[Hit]) -> tuple[float, float]:
+def cluster_interval(hits: Sequence[Hit]) -> tuple[float, float]:
     """95 % interval of a share over cases of which several are of one rig.
 
     Wilson's, at the number of independent cases that has the variance which the shares of the rigs show (Kish's design
@@ -39,7 +39,7 @@ def _share(figure: str, asked: float | None, hits: Sequence[Hit], at_most: bool 
     share = sum(hit for _, hit in hits) / len(hits) if hits else math.nan
     met = None if not hits or asked is None else (share <= asked if at_most else share >= asked)
     bound = "" if asked is None else f"{'<=' if at_most else '>='} {100 * asked:.0f} %"
-    return Row(figure=figure, asked=bound, value=share, interval=clustered(hits), count=len(hits), met=met)
+    return Row(figure=figure, asked=bound, value=share, interval=cluster_interval(hits), count=len(hits), met=met)
 
 
 def _number(figure: str, asked: str, value: float, count: int, met: bool) -> Row:

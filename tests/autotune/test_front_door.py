@@ -19,7 +19,7 @@ from autotune.errors import IdentificationError
 from autotune.identification.dependence import require_answer
 from autotune.identification.recorded_plant import fit_recordings
 from autotune.models import TransferFunction
-from autotune.pipeline import analyse, measured_of
+from autotune.pipeline import analyse, measure_plant
 from autotune.recording import Recording
 from tests.benchmarks._front_door_files import BOILER, DOORS, EXCHANGER, OVEN, Rows, closed_loop, levels, open_loop
 from tests.benchmarks.front_door import best, load_error, tuned
@@ -92,7 +92,7 @@ def test_what_the_period_of_the_file_costs_is_said_and_another_may_be_given(tmp_
     rows = open_loop(fast, u, 1.0, 0.05, 30.0, 50.0, 5)
     recordings = [_recording(rows)]
     told: list[str] = []
-    found = measured_of(recordings, progress=lambda what, share: told.append(what))
+    found = measure_plant(recordings, progress=lambda what, share: told.append(what))
     assert {"asking whether y answers u", "fitting order 1", "fitting order 3, integrating"} <= set(told)
     slow, quick = (
         analyse(found.points, DesignSettings(sample_time_s=period), fit=found.fit, facts=found.facts, compare=False)
@@ -147,7 +147,7 @@ def test_the_inverse_of_the_controller_is_not_taken_for_the_plant(seed: int) -> 
     """With seed 23 it fits the rows best; the points by way of the set-point are 20 standard deviations from it."""
     r = levels(1.0, (100.0, 0.0), (400.0, 5.0), (400.0, -2.0), (300.0, 3.0))
     rows = closed_loop(EXCHANGER, r, 1.0, 0.4, 60.0, 0.1, 50.0, 40.0, seed)
-    fit = measured_of([Recording(t=rows.t, u=rows.u, y=rows.y, extra={"r": rows.r}, name="loop")]).fit
+    fit = measure_plant([Recording(t=rows.t, u=rows.u, y=rows.y, extra={"r": rows.r}, name="loop")]).fit
     assert fit is not None
     omega = np.array([0.03])  # below the crossover, at .046 rad/s
     np.testing.assert_allclose(fit.plant.response(omega), EXCHANGER.response(omega), rtol=0.15)

@@ -73,11 +73,11 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path: Pat
 
 def test_the_files_of_a_folder_come_together_or_not_at_all(tmp_path: Path) -> None:
     place = OutputFolder(tmp_path / "out", ("a.json", "b.html"))
-    with pytest.raises(RuntimeError), place.filled() as folder:  # noqa: PT012 - it stops between two files
+    with pytest.raises(RuntimeError), place.write_all() as folder:  # noqa: PT012 - it stops between two files
         (folder / "a.json").write_text("1")
         raise RuntimeError("stopped between two files")
     assert list((tmp_path / "out").iterdir()) == []
-    with place.filled() as folder:
+    with place.write_all() as folder:
         (folder / "a.json").write_text("1")
         (folder / "b.html").write_text("2")
     assert {file.name for file in (tmp_path / "out").iterdir()} == {"a.json", "b.html"}
@@ -90,7 +90,7 @@ def test_what_is_refused_after_its_place_was_claimed_leaves_no_folder(tmp_path: 
     one, several = Output(tmp_path / "new" / "deep" / "a.json"), OutputFolder(tmp_path / "there" / "out", ("b.json",))
     assert [file.name for file in tmp_path.rglob("*")] == ["there"]
     one.json({})
-    with several.filled() as folder:
+    with several.write_all() as folder:
         (folder / "b.json").write_text("1")
     assert (tmp_path / "new" / "deep" / "a.json").exists()
     assert (tmp_path / "there" / "out" / "b.json").exists()
@@ -212,7 +212,7 @@ def test_an_interrupt_at_any_call_leaves_a_whole_file_or_none(tmp_path: Path, wa
         elif way == "whole":
             write_json(place / "a.json", {"a": 1})
         else:
-            with OutputFolder(place / "new", ["a.json"]).filled() as part:
+            with OutputFolder(place / "new", ["a.json"]).write_all() as part:
                 (part / "a.json").write_text('{"a": 1}')
 
     def interrupted_at(number: int, place: Path) -> bool:

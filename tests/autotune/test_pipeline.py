@@ -23,7 +23,7 @@ from autotune.identification.parametric import fit_plant
 from autotune.models import TransferFunction
 from autotune.pipeline import analyse, hand_over, tune
 from autotune.pipeline.deployment import deploy
-from autotune.pipeline.folder import differences, next_free, read_interrupted, store_config, stored_config
+from autotune.pipeline.folder import differences, next_free, read_interrupted, read_stored_config, store_config
 from autotune.pipeline.mismatch import around_operating_point, resting_command
 from autotune.points import FrequencyPoint, points_to_json
 from autotune.recording import read_recording
@@ -243,7 +243,7 @@ def test_the_stored_configuration_is_the_one_that_was_given(tmp_path: Path) -> N
     for path in sorted(CONFIGS.glob("ball_*.toml")):
         config = load_config(path)
         store_config(config, tmp_path)
-        assert stored_config(tmp_path) == config
+        assert read_stored_config(tmp_path) == config
 
 
 def test_a_run_is_not_gone_on_with_under_other_limits_and_the_refusal_names_them(tmp_path: Path) -> None:

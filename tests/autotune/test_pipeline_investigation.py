@@ -20,7 +20,7 @@ from autotune.experiment.excitation import Excitation
 from autotune.experiment_design import with_next_experiment
 from autotune.experiment_design.conditions import as_recorded, conditions_of
 from autotune.experiment_design.open_hypotheses import open_hypotheses
-from autotune.experiment_design.plan import excitations, planned_recording
+from autotune.experiment_design.plan import excitations, predict_recording
 from autotune.model_tables import read_model, write_model
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.pipeline.investigation import Budget, Investigation, Listeners, investigate
@@ -109,7 +109,7 @@ def test_effects_that_command_and_reading_cannot_tell_apart_count_as_one() -> No
     slow = replace(lagged.blocks[-1], dynamics=TransferFunction(num=(1.0,), den=(20.0, 1.0)))
     sim = assemble(replace(lagged, blocks=(*lagged.blocks[:-1], slow)))
     steps = excitations(sim, config, 2000.0)[2]
-    planned = planned_recording(sim, config, steps)
+    planned = predict_recording(sim, config, steps)
     assert planned is not None
     recording = replace(planned, y=planned.y + 0.02 * rng.normal(size=len(planned)))
     rest = [name for name in KINDS if name not in ("actuator.lag", "sensor.lag")]
@@ -123,7 +123,7 @@ def test_effects_that_command_and_reading_cannot_tell_apart_count_as_one() -> No
 @pytest.mark.parametrize("swing", [1.0, 3.0])
 def test_planned_experiments_keep_within_the_limits_by_their_own_prediction(swing: float) -> None:
     config, sim = conditions_of(tanks_config(swing)), assemble(tanks_model())
-    planned = [planned_recording(sim, config, one) for one in excitations(sim, config, 2000.0)]
+    planned = [predict_recording(sim, config, one) for one in excitations(sim, config, 2000.0)]
     assert len(planned) == 8
     for recording in planned:
         assert recording is not None
@@ -167,7 +167,7 @@ def test_the_command_ends_at_once_where_the_simulation_explains_the_recording(tm
     model, config = tanks_model(), CONFIGS / "two_tank_sim.toml"
     sim = assemble(model)
     conditions = conditions_of(tanks_config())
-    planned = planned_recording(sim, conditions, excitations(sim, conditions, 1600.0)[0])
+    planned = predict_recording(sim, conditions, excitations(sim, conditions, 1600.0)[0])
     assert planned is not None
     noisy = replace(planned, y=planned.y + 0.02 * np.random.default_rng(2).normal(size=len(planned)))
     write_recording(noisy, tmp_path / "rec.csv")
@@ -198,7 +198,7 @@ def test_a_diagnosis_asks_for_an_experiment_between_the_hypotheses_left_that_goe
     left = [name for name in rivals if name in asked.purpose]
     assert len(left) == 2
     assert set(left) <= set(open_hypotheses(found))
-    planned = planned_recording(
+    planned = predict_recording(
         found.search.retuned.fit.sim, as_recorded(found), Excitation(kind=asked.kind, **asked.settings)
     )
     assert planned is not None

@@ -19,7 +19,7 @@ import numpy as np
 from autotune.batch.engine import cluster, run_all
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.confidence import pole_covariance, response_covariance
-from autotune.identification.closed_loop.order import choose_order, fixed_order
+from autotune.identification.closed_loop.order import choose_order, fit_order
 from autotune.identification.closed_loop.prediction_error import prediction_error
 from autotune.identification.closed_loop.refit import refit_inputs
 from autotune.identification.closed_loop.state_space import (
@@ -67,7 +67,7 @@ METHODS: dict[str, Method] = {
     "SSARX p=30 f=10": lambda d: ssarx(d.u, d.y, 5, p=30, f=10),
     "PBSIDopt p=30 f=10": lambda d: pbsid_opt(d.u, d.y, 5, p=30, f=10),
     "PO-MOESP, feedback ignored": lambda d: _open_loop(d),
-    "default (polished)": lambda d: fixed_order(d.u, d.y, 5).model,
+    "default (polished)": lambda d: fit_order(d.u, d.y, 5).model,
     "  the polish begun at the truth": lambda d: prediction_error(PLANT, d.u, d.y).model,
 }
 
@@ -215,7 +215,7 @@ def _race(sets: Sequence[LoopData]) -> None:
     ratios, own, other = [], [], []
     for d in sets:
         began = time.process_time()
-        fixed_order(d.u, d.y, 5)
+        fit_order(d.u, d.y, 5)
         between = time.process_time()
         parsim_k(d)
         own.append(between - began)
@@ -264,7 +264,7 @@ def coverage(count: int) -> None:
     for seed in range(count):
         d = example_set(seed)
         try:
-            estimate = fixed_order(d.u, d.y, 5)
+            estimate = fit_order(d.u, d.y, 5)
             covariance = response_covariance(estimate, omega)[:, 0, 0]
         except IdentificationError:
             failed += 1
@@ -307,7 +307,7 @@ def linear_time(rows_max: int) -> None:
         d = example_set(0, rows=rows)
         tracemalloc.start()
         began = time.process_time()
-        fixed_order(d.u, d.y, 5)
+        fit_order(d.u, d.y, 5)
         spent = time.process_time() - began
         peak = tracemalloc.get_traced_memory()[1] / 1e6
         tracemalloc.stop()

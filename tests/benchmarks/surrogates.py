@@ -141,9 +141,9 @@ def surrogate(family: str, seed: int) -> Recording:
 
 def _tune(recording: Recording, true: TransferFunction | None) -> bool:
     from autotune.config.procedure import DesignSettings
-    from autotune.pipeline import analyse, measured_of
+    from autotune.pipeline import analyse, measure_plant
 
-    found, asked = measured_of([recording]), DesignSettings(criterion="iae")
+    found, asked = measure_plant([recording]), DesignSettings(criterion="iae")
     design = analyse(found.points, asked, fit=found.fit, facts=found.facts, compare=False).design
     if true is None:
         return True

@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from autotune.config import Config, validated
+from autotune.config import Config, validate
 from autotune.entry import main
 from tests.forked import call
 
@@ -201,7 +201,7 @@ def _loads(content: str, where: str) -> None:
     base = tomllib.loads((CONFIGS / "ball_modbus_tcp.toml").read_text(encoding="utf-8"))
     given = tomllib.loads(content)
     merged = {**base, **{name: _merged(base.get(name), table) for name, table in given.items()}}
-    validated(Config, merged, where)
+    validate(Config, merged, where)
 
 
 def _merged(base: Any, given: Any) -> Any:

@@ -253,9 +253,9 @@ def test_a_controller_whose_set_point_is_not_said_is_left_to_a_person(monkeypatc
         rig.open()
         rig.start_controller(0.2)  # type: ignore[attr-defined]  # of this one
         rig.close()
-        known = SerialRig._obeyed
+        known = SerialRig._obey
         monkeypatch.setattr(  # firmware before version 3
-            SerialRig, "_obeyed", lambda self, kind, payload: 1 if kind == 0x0B else known(self, kind, payload)
+            SerialRig, "_obey", lambda self, kind, payload: 1 if kind == 0x0B else known(self, kind, payload)
         )
         rig.open()
         assert isinstance(rig, HandsBack)

@@ -23,7 +23,7 @@ from autotune.experiment.rig import RoundsGains
 from autotune.identification.parametric import PlantFit, fit_plant
 from autotune.models import TransferFunction
 from autotune.pipeline.deployment import deploy
-from autotune.pipeline.held_gains import held_by
+from autotune.pipeline.held_gains import round_to_rig
 from autotune.points import FrequencyPoint
 from sim.modbus_rig import ModbusRig, TcpTransport
 from sim.register_device import RegisterDevice
@@ -218,16 +218,16 @@ def test_a_resolution_that_takes_a_margin_is_refused_and_one_that_does_not_is_th
     before = margins(fit.plant, exact)
     assert before.modulus == pytest.approx(0.5, abs=0.05)  # about what is asked for: nothing to give away
     with served(coarse(1.0)) as (_, rig):  # K = 2 keeps the margins, and loses a fifth of the gain
-        held = held_by(rig, exact, asked, fit=fit)
+        held = round_to_rig(rig, exact, asked, fit=fit)
         assert held == PIDController(K=2.0, Ti_s=2.0)
         up = PIDController(K=2.6, Ti_s=2.0)
         with pytest.raises(InputError, match=r"modulus margin of 0\.470.*rig.registers.K .* scale = 0.02"):
-            held_by(rig, up, asked, fit=fit)
+            round_to_rig(rig, up, asked, fit=fit)
     with (
         served(coarse(1.0, Ti_scale=1.0)) as (_, rig),
         pytest.raises(InputError, match=r"Ti_s would be inf.*rig.registers.Ti holds 0 for 0.4: scale = 0.002"),
     ):
-        held_by(rig, PIDController(K=2.0, Ti_s=0.4), asked)
+        round_to_rig(rig, PIDController(K=2.0, Ti_s=0.4), asked)
 
 
 @given(K=st.floats(-30.0, 30.0), Ti_s=st.floats(0.01, 600.0), scale=st.sampled_from([1e-3, 0.02, 0.1, 1.0]))

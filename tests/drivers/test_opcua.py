@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import tomli_w
 
-from autotune.cli.served import served_opcua
+from autotune.cli.served import serve_opcua
 from autotune.config import Config, load_config
 from autotune.config.rig import OpcUaSettings
 from autotune.errors import AutotuneError, InputError, LinkError
@@ -60,7 +60,7 @@ def ball(folder: Path, *, secured: bool = True, **rig: Any) -> Config:
 def served_ball(config: Config, **given: Any) -> Iterator[tuple[GainRegisterRig, Any]]:
     """Serve the configuration's ball; yield the rig and the server."""
     assert isinstance(config.rig, OpcUaSettings)
-    with served_opcua(config, config.rig, **given) as server:
+    with serve_opcua(config, config.rig, **given) as server:
         rig = open_rig(config.rig, u_range=(0.0, 10.0), u_safe=0.0)
         assert isinstance(rig, GainRegisterRig)
         try:
@@ -129,12 +129,12 @@ def test_a_server_that_restarts_is_met_by_a_new_session_and_the_sample_is_suspec
     assert isinstance(config.rig, OpcUaSettings)
     link_config = config.rig
     with ExitStack() as stack:
-        first = stack.enter_context(served_opcua(config, link_config))
+        first = stack.enter_context(serve_opcua(config, link_config))
         rig: Any = open_rig(link_config, u_range=(0.0, 10.0), u_safe=0.0)
         rig._link.connect()
         assert not rig._ask()[0].suspect
         first.__exit__(None, None, None)
-        stack.enter_context(served_opcua(config, link_config))
+        stack.enter_context(serve_opcua(config, link_config))
         reading, _ = rig._ask()
         assert reading.suspect
         assert 0.0 <= reading.y <= 10.0
@@ -221,7 +221,7 @@ def test_probe_reads_every_node_once_and_writes_nothing(certificates: Path) -> N
         assert re.search(r"; a sample takes .* sample times from [125]0* ms on$", found.description)
         assert not server.device.by_host
         assert server.device.value["heartbeat"] == 0.0
-    reach = kind_of(config.rig).reached_by(config.rig)
+    reach = kind_of(config.rig).reach_of(config.rig)
     assert reach.address is not None
     assert len(reach.files) == 3
 

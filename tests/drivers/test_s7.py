@@ -63,10 +63,10 @@ def rig_of(config: Config, **changes: Any) -> GainRegisterRig:
 @contextmanager
 def served_ball(config: Config) -> Iterator[tuple[GainRegisterRig, S7Rig]]:
     """Serve the configuration's ball; yield the rig and the CPU."""
-    from autotune.cli.served import served_s7
+    from autotune.cli.served import serve_s7
 
     assert isinstance(config.rig, S7Settings)
-    with served_s7(config, config.rig) as server:
+    with serve_s7(config, config.rig) as server:
         rig = rig_of(config)
         try:
             yield rig, server
@@ -276,7 +276,7 @@ def test_probe_reads_every_place_once_and_says_what_looks_wrong(tmp_path: Path) 
         assert told["y"][1] == 'would be 7 with type = "REAL"'
         assert "optimised access" in told["setpoint"][0]
         assert server.device.value["heartbeat"] == 0.0
-    assert kind_of(config.rig).reached_by(config.rig).address == ("127.0.0.1", config.rig.port)  # type: ignore[union-attr]
+    assert kind_of(config.rig).reach_of(config.rig).address == ("127.0.0.1", config.rig.port)  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(

@@ -246,5 +246,5 @@ def test_device_time_goes_on_through_its_wrap() -> None:
         rig.open()
         first = rig.read().device_time_s
         # 32 bits of microseconds are 71.6 minutes
-        stamps = [rig._unwrapped((first + 1000.0 * k) * 1e6 % 2**32) for k in range(12)]
+        stamps = [rig._unwrap_stamp((first + 1000.0 * k) * 1e6 % 2**32) for k in range(12)]
         assert stamps == pytest.approx([first + 1000.0 * k for k in range(12)])

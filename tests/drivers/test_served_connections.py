@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import sim.opcua_rig
-from autotune.cli.served import served_opcua
+from autotune.cli.served import serve_opcua
 from autotune.config.rig import OpcUaSettings
 from sim.bounded_connection import BoundedConnection
 from sim.modbus_rig import ModbusRig, TcpTransport
@@ -97,5 +97,5 @@ def test_an_opc_ua_connection_without_a_session_is_ended(tmp_path: Path, monkeyp
     config = ball(tmp_path, secured=False)
     assert isinstance(config.rig, OpcUaSettings)
     port = int(config.rig.endpoint.rsplit(":", 1)[1].rstrip("/"))
-    with served_opcua(config, config.rig), opened(port, b"HELF") as line:
+    with serve_opcua(config, config.rig), opened(port, b"HELF") as line:
         assert answer(line) == b""

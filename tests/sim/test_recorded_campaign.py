@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from sim.proof import diagnose, seal
-from sim.recorded.campaign import RecordedMark, as_json, conceal, mark_all, opened, raises_alarm
+from sim.recorded.campaign import RecordedMark, as_json, conceal, mark_all, open_campaign, raises_alarm
 from sim.recorded.cases import STRENGTHS, make, prepare
 from sim.recorded.rigs import RefusedError, read
-from sim.recorded.score import by_rig, clustered, table
+from sim.recorded.score import by_rig, cluster_interval, table
 from sim.score import mark, wilson
 from tests.sim.recorded_rig import record, write_recording, write_rig
 
@@ -43,7 +43,7 @@ def rigs(tmp_path):
 
 
 def begun(rigs, out, count=6):
-    campaign = opened(rigs, out, count, 100_000, (sys.executable, str(rigs.parent / "tool.py")))
+    campaign = open_campaign(rigs, out, count, 100_000, (sys.executable, str(rigs.parent / "tool.py")))
     list(conceal(campaign))
     return campaign
 
@@ -128,11 +128,11 @@ def test_a_name_that_was_not_said_before_is_an_alarm():
 
 def test_an_interval_over_rigs_that_differ_is_wider_and_where_all_agree_each_rig_counts_once():
     alike = [(f"rig {i}", i % 2 == 0) for i in range(40)]
-    assert clustered(alike) == pytest.approx(wilson(20, 40), abs=0.01)
+    assert cluster_interval(alike) == pytest.approx(wilson(20, 40), abs=0.01)
     differ = [(f"rig {i // 10}", i // 10 % 2 == 0) for i in range(40)]
-    assert clustered(differ)[1] - clustered(differ)[0] > 1.8 * (wilson(20, 40)[1] - wilson(20, 40)[0])
-    assert clustered([(f"rig {i // 4}", True) for i in range(40)]) == wilson(10, 10)
-    assert clustered([]) == (0.0, 1.0)
+    assert cluster_interval(differ)[1] - cluster_interval(differ)[0] > 1.8 * (wilson(20, 40)[1] - wilson(20, 40)[0])
+    assert cluster_interval([(f"rig {i // 4}", True) for i in range(40)]) == wilson(10, 10)
+    assert cluster_interval([]) == (0.0, 1.0)
 
 
 def test_the_interval_over_rigs_covers_the_share_of_rigs_that_differ():
@@ -140,7 +140,7 @@ def test_the_interval_over_rigs_covers_the_share_of_rigs_that_differ():
     inside = []
     for _ in range(1000):
         shares = np.repeat(rng.beta(6.0, 2.0, 25), 4)  # correlation within a rig 1/9
-        low, high = clustered([(str(i // 4), bool(rng.random() < p)) for i, p in enumerate(shares)])
+        low, high = cluster_interval([(str(i // 4), bool(rng.random() < p)) for i, p in enumerate(shares)])
         inside.append(low <= 0.75 <= high)
     assert 0.92 < np.mean(inside) < 0.98
 

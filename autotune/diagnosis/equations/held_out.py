@@ -12,7 +12,7 @@ from autotune.diagnosis.evidence.stretches import FAR_OFF
 from autotune.equations.fit_data import window_rows
 from autotune.equations.sensitivity import Windows, run_windows
 from autotune.equations.simulate import Compiled, Drive, simulate
-from autotune.equations.starts import LEAST, fitted_starts
+from autotune.equations.starts import LEAST, fit_starts
 
 #: Share of the recording that is kept for judging, and of that the share that a start state is found from.
 HELD_OUT, SETTLED = 1.0 / 3.0, 0.15
@@ -56,7 +56,7 @@ def _started(
     first, last = int(at[0]), int(at[0] + max(int(share * (end[0] - at[0])), 1))
     best, smallest = None, np.inf
     for guess in (None, *(one for one in guesses if one is not None)):
-        w = fitted_starts(compiled, p, drive, y, good, at, end, guess=guess, share=share, least=least)
+        w = fit_starts(compiled, p, drive, y, good, at, end, guess=guess, share=share, least=least)
         e = (y - run_windows(compiled, p, drive, replace(w, stops=np.array([last]))).y)[first:last]
         left = float(np.nansum(e**2)) if np.all(np.isfinite(e[good[first:last]])) else np.inf
         if best is None or left < smallest:

@@ -29,7 +29,7 @@ from autotune.equations.effects import (
     where_of,
     with_values,
 )
-from autotune.equations.expressions import Call, Expression, Name, Number, names_in, parse, substituted, to_text
+from autotune.equations.expressions import Call, Expression, Name, Number, names_in, parse, substitute, to_text
 from autotune.equations.model import EquationModel, Extension, InputColumn, State
 from autotune.equations.parameter_scales import values_of
 from autotune.equations.sensitivity import run_windows
@@ -127,7 +127,7 @@ class EquationLine(LawLine):
 
         shell = EquationModel(
             name="law", inputs=(InputColumn(column="x"),), parameters=(),
-            output=substituted(parse(text_of(form, effect)), bound),
+            output=substitute(parse(text_of(form, effect)), bound),
             states=(State(name="nothing", derivative=Name("nothing"), start=0.0),),
         )  # fmt: skip
         compiled = compile_model(shell)

@@ -32,7 +32,7 @@ from autotune.diagnosis.selection.search import Found, Proposals, search
 from autotune.diagnosis.simulation.assembly import input_size
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
-from autotune.effects import ALL, taken_by
+from autotune.effects import ALL, related_effects
 from autotune.effects.base import PRIOR_ODDS, EffectKind, SignalSizes
 from autotune.effects.rigs import rig_kind
 from autotune.models import Effect, Model
@@ -232,7 +232,7 @@ def _starts(base: JudgedChain, bench: Bench) -> list[_Start]:
     scales = [(base.fit, bench.long)]
     if bench.has_shorter and base.error > bench.limits.out_of_phase:
         scales.append((bench.shortened(base.fit), bench.few))
-    taken = taken_by(base.names)
+    taken = related_effects(base.names)
     tried = [
         (kind, odds, near, data)
         for kind, odds in bench.odds

@@ -19,7 +19,7 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.stretches import STRETCHES
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.effects import called
+from autotune.effects import shared_name
 from autotune.models import Effect
 
 #: Added to squared errors, for a stretch without rows has none.
@@ -202,8 +202,8 @@ def of_likely(found: Sequence[_J], likely: Collection[str]) -> _J:
     be taken for all.
     """
     able = [one for one in found if set(one.names) <= set(likely)]
-    most = max(len({called(name) for name in one.names}) for one in able)
-    return rank([one for one in able if len({called(name) for name in one.names}) == most])[0]
+    most = max(len({shared_name(name) for name in one.names}) for one in able)
+    return rank([one for one in able if len({shared_name(name) for name in one.names}) == most])[0]
 
 
 def probabilities(found: Sequence[_J], best: _J, unknown_odds: float) -> tuple[Candidate, ...]:

@@ -17,7 +17,7 @@ from autotune.diagnosis.selection.hypothesis import Hypothesis
 from autotune.diagnosis.selection.retuned_numbers import RetunedNumber, retuned_numbers
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import kind_of
-from autotune.equations.identifiability import Combination, determined
+from autotune.equations.identifiability import Combination, combinations_by_certainty
 from autotune.models import Model
 from autotune.recording import Recording
 
@@ -104,7 +104,7 @@ class Search:
         spread = np.array([free[i].spread for i in told])
         believed = result.covariance[np.ix_(told, told)] / np.outer(spread, spread)
         names = [f"{called[free[i].name].block} {called[free[i].name].name}" for i in told]
-        return determined(believed, spread, names)
+        return combinations_by_certainty(believed, spread, names)
 
     def hypotheses(self) -> list[tuple[str, float]]:
         """Return combinations of effects with the decrease of chi-square, numbers paid for, the best first."""

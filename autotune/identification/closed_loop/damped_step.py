@@ -30,7 +30,7 @@ class Ahead:
     converged: bool
 
 
-def improved(
+def improve(
     predictor: Predictor,
     directions: FloatArray,
     information: FloatArray,
@@ -64,13 +64,13 @@ def improved(
     bounded = False
     while True:
         step, predicted, damping = damped_step(information, gradient, damping)
-        trial = predictor.moved(step, directions)
+        trial = predictor.move_along(step, directions)
         beyond = _radius(trial) > _RADIUS_LIMIT
         bounded = bounded or beyond
         if beyond:
             step = _onto_boundary(predictor, directions, information, step)
             predicted = -float(step @ (2.0 * gradient + information @ step))
-            trial = predictor.moved(step, directions)
+            trial = predictor.move_along(step, directions)
         if predicted < _TOLERANCE and not beyond:
             return Ahead(predictor=None, errors=errors, predicted=predicted, damping=damping, converged=True)
         if predicted >= _TOLERANCE and _radius(trial) <= _RADIUS_LIMIT:
@@ -170,7 +170,7 @@ def _onto_boundary(
     Zeros of the noise model do lie there: a trend taken out, or an integrating plant with white noise on its sensor.
     """
     for _ in range(3):
-        trial = predictor.moved(step, directions)
+        trial = predictor.move_along(step, directions)
         excess = _radius(trial) - (_RADIUS_LIMIT - 1e-7)
         if not 0.0 < excess < 1.0:
             break

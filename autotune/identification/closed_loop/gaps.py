@@ -41,7 +41,7 @@ class Bridged:
     rows: int
 
 
-def bridged(recording: Recording, jitter: float) -> Bridged:
+def bridge_gaps(recording: Recording, jitter: float) -> Bridged:
     """Return the record with up to three missing samples in a row put in, where they are few.
 
     Parameters
@@ -165,7 +165,7 @@ def usable_stretches(recording: Recording, shortest: int) -> tuple[tuple[Recordi
 
 def _examine(recording: Recording) -> tuple[Bridged, BoolArray, BoolArray]:
     """Return the bridged record, which of its rows hold numbers, and after which of them time jumps."""
-    whole = bridged(recording, JITTER)
+    whole = bridge_gaps(recording, JITTER)
     columns = [whole.recording.u, whole.recording.y]
     columns += [c for name, c in whole.recording.extra.items() if name in ("r", "dither") and np.isfinite(c).any()]
     good = np.all([np.isfinite(column) for column in columns], axis=0)

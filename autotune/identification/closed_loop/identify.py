@@ -28,7 +28,7 @@ from autotune.identification.closed_loop.design_points import design_points
 from autotune.identification.closed_loop.dither_proposal import DitherLimits, DitherProposal, propose_dither
 from autotune.identification.closed_loop.gaps import usable_stretches
 from autotune.identification.closed_loop.loop_excitation import ExcitationVerdict, judge, own_motion, require_excitation
-from autotune.identification.closed_loop.order import Candidate, choose_order, default_past_window, fixed_order
+from autotune.identification.closed_loop.order import Candidate, choose_order, default_past_window, fit_order
 from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate
 from autotune.identification.closed_loop.series import Series
 from autotune.identification.closed_loop.state_space import InnovationModel
@@ -190,7 +190,7 @@ def _fit(
     if order < 1 or (delay or 0) < 0:
         raise InputError(f"order {order}, delay {delay}", remedy="the order is at least 1, the dead time at least 0")
     progress(f"order {order}", 0.0)
-    return fixed_order(u, y, order, delay=delay or 0, starts=starts), (), ()
+    return fit_order(u, y, order, delay=delay or 0, starts=starts), (), ()
 
 
 def _starts(pieces: Sequence[Recording]) -> tuple[int, ...]:

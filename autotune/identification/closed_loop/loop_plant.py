@@ -22,7 +22,7 @@ from autotune.identification.closed_loop.state_space import InnovationModel
 from autotune.identification.closed_loop.structures import Structures
 from autotune.identification.parametric import PlantFit
 from autotune.models import TransferFunction
-from autotune.schema import Number, Section, Time, validated
+from autotune.schema import Number, Section, Time, validate
 from autotune.text_files import read_json
 
 #: Halvings of a step from the estimate until the plant there has a continuous form.
@@ -247,7 +247,7 @@ def read_loop_region(path: str | os.PathLike[str]) -> LoopRegion | None:
     where = f"{path} plant_region"
     if not isinstance(region, dict):
         raise InputError("is no table of keys", where=where, remedy="write it with autotune identify closed-loop")
-    return _as_region(validated(_Region, region, where))
+    return _as_region(validate(_Region, region, where))
 
 
 def _as_region(found: _Region) -> LoopRegion:

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from autotune.arrays import FloatArray
 from autotune.controller import DiscreteController
 from autotune.errors import IdentificationError, InputError
-from autotune.identification.closed_loop.order import choose_order, default_past_window, fixed_order
+from autotune.identification.closed_loop.order import choose_order, default_past_window, fit_order
 from autotune.identification.closed_loop.refit import refit_inputs
 from autotune.identification.closed_loop.state_space import InnovationModel
 from autotune.identification.closed_loop.subspace_direct import pbsid_opt, ssarx
@@ -158,7 +158,7 @@ def _direct(u: FloatArray, y: FloatArray, order: int, method: Method, windows: W
         case "ssarx":
             return ssarx(u, y, order, p=p, f=f)
         case _:
-            return fixed_order(u, y, order, p=windows.p).model
+            return fit_order(u, y, order, p=windows.p).model
 
 
 def _by_excitation(

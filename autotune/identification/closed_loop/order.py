@@ -193,7 +193,7 @@ def choose_order(
     return OrderChoice(estimate=estimate, others=_others(fits, best), evidence=evidence)
 
 
-def fixed_order(
+def fit_order(
     u: FloatArray,
     y: FloatArray,
     order: int,

@@ -14,7 +14,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.closed_loop.damped_step import damped_step, improved, log_determinant, whitened_equations
+from autotune.identification.closed_loop.damped_step import damped_step, improve, log_determinant, whitened_equations
 from autotune.identification.closed_loop.predictor_directions import (
     Predictor,
     behaviour_directions,
@@ -187,7 +187,7 @@ def _solve_along(predictor: Predictor, series: Series, directions: FloatArray) -
     one = np.eye(predictor.F.shape[1])[-1:]  # the regressor of a load; the state has none
     total = whitened_equations(predictor, directions, series, series.scatter(predictor), one)
     step = damped_step(total[:-1, :-1], total[:-1, -1], 0.0)[0]
-    return predictor.moved(step, series.moving(predictor, directions))
+    return predictor.move_along(step, series.moving(predictor, directions))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -236,7 +236,7 @@ def _search(
         converged = bool(np.all(np.diag(errors) <= floor))
         if converged or iterations == max_iterations:
             break
-        ahead = improved(predictor, directions[:, :used], information, gradient, errors, series, damping)
+        ahead = improve(predictor, directions[:, :used], information, gradient, errors, series, damping)
         if offset and not constant and ahead.predicted < _NEAR:
             gain = damped_step(total[:-1, :-1], total[:-1, -1], 0.0)[1] - ahead.predicted
             constant = gain > n_y * math.log(len(y))  # what the Bayesian criterion asks of n_y parameters

@@ -70,7 +70,7 @@ class Predictor:
         n, n_y = self.F.shape[0], self.H.shape[0]
         return n, self.H.shape[1] - n - 1, n_y
 
-    def moved(self, step: FloatArray, directions: FloatArray) -> Predictor:
+    def move_along(self, step: FloatArray, directions: FloatArray) -> Predictor:
         """Return the predictor after a step.
 
         Parameters

@@ -14,9 +14,9 @@ from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay.data import DelayData, PastInput, input_period, prepare
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.output_error import Point, Structure, minimise, residuals, solve_linear
-from autotune.identification.delay.output_error_model import finish, polish, widened
+from autotune.identification.delay.output_error_model import finish, polish, widen_intervals
 from autotune.identification.delay.profile import profile
-from autotune.identification.delay.search import binned, scan, search
+from autotune.identification.delay.search import average_bins, scan, search
 from autotune.identification.dependence import latest_answer_s
 from autotune.identification.noise_colour import whitening_filter
 from autotune.models import Hold
@@ -130,12 +130,12 @@ def identify_delay(
     candidates = search(searched, structure, max_delay_s=largest)
     finest = min(c.rows_per_bin for c in candidates)
     bins = max(_MIDDLE_BINS, 10 * data.ty.size // finest)
-    middle = binned(searched, bins)
+    middle = average_bins(searched, bins)
     best = _best_on_common_rows(middle, structure, [c.point for c in candidates], largest)
     if _is_ambiguous(middle, structure, best):
         progress("comparing delays", 0.6)
-        best = scan(binned(middle, _SCANNED_BINS), structure, best, max_delay_s=largest)
-    middle = binned(data, bins)
+        best = scan(average_bins(middle, _SCANNED_BINS), structure, best, max_delay_s=largest)
+    middle = average_bins(data, bins)
     progress("fitting", 0.8)
     return _polish_on_all_rows(data, middle, structure, best, largest, coloured)
 
@@ -222,7 +222,7 @@ def _polish_on_all_rows(
         model = finish(usable, structure, best, colour.whitening)
         _require_inside(data, model, largest)
         if model.standard_deviations[structure.order] < _LINEAR * abs(model.b):
-            return widened(model, structure, colour)
+            return widen_intervals(model, structure, colour)
         if structure.order >= _COMPARED_ORDER:
             _require_order(data, structure, best, model, largest)
         _require_determined(data, model, largest)
@@ -231,7 +231,7 @@ def _polish_on_all_rows(
             raise _refusal_of_order(data, found.model, largest, f"nothing bounds {found.endless}")
         if found.lower is None:
             _require_determined(data, found.model, largest)
-            return widened(found.model, structure, colour)
+            return widen_intervals(found.model, structure, colour)
         best = found.lower
     raise _refusal_of_order(data, model, largest, "several sets of parameters explain it alike")
 

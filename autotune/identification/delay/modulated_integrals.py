@@ -66,7 +66,7 @@ def modulated_by_fourier_sums(recording: Recording, order: int, intervals: Seque
 
         def at(h: float) -> ComplexArray:
             first, last = starts - h, ends - h
-            parts = [interpolated(t, running, last) - interpolated(t, running, first) for running in sums]
+            parts = [interpolate(t, running, last) - interpolate(t, running, first) for running in sums]
             return np.column_stack(
                 [part * np.exp(-1j * omega / L * first) for part, (_, omega) in zip(parts, terms, strict=True)]
             )
@@ -150,7 +150,7 @@ def running_fourier(t: FloatArray, values: FloatArray, omega: float, held: bool)
     return result
 
 
-def interpolated(t: FloatArray, running: ComplexArray, at: FloatArray) -> ComplexArray:
+def interpolate(t: FloatArray, running: ComplexArray, at: FloatArray) -> ComplexArray:
     """Return a running integral at any times, linear between its rows.
 
     Parameters

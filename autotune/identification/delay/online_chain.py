@@ -138,7 +138,7 @@ def _derivatives(J: FloatArray, n: int, lam: float) -> FloatArray:
 
 
 @njit(cache=True)
-def _delayed(
+def _chain_in_past(
     t: FloatArray, u: FloatArray, past: FloatArray, k: int, at: float, row: int, lam: float, linear: bool
 ) -> tuple[FloatArray, int]:
     """Return the chain of u at a time in the past, and the row it was carried on from."""
@@ -207,7 +207,7 @@ def step_row(
     past[k] = Ju
     Jh = Ju
     if delayed:
-        Jh, row = _delayed(t, u, past, k, t[k] - scalars[H], int(scalars[ROW]), lam, linear)
+        Jh, row = _chain_in_past(t, u, past, k, t[k] - scalars[H], int(scalars[ROW]), lam, linear)
         scalars[ROW] = row
     C, D = _equations(Jy, Jh, n, lam, delayed)
     if gain > 0.0:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autotune.arguments import checked
+from autotune.arguments import check_arguments
 from autotune.arrays import FloatArray, is_real
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay import online_chain as chain
@@ -221,10 +221,10 @@ class OnlineEstimator:
             return self._sample(t, np.full(n, np.nan), np.full(self._carried.R.shape, np.nan))
         state, covariance, locked = chain.step_row(k, self._t, self._u, self._past, y, self._carried, self._settings)
         if not locked:
-            raise _lost(t)
+            raise _refusal_of_rows(t)
         return self._filled_sample(t, state, covariance)
 
-    @checked
+    @check_arguments
     def run(self, t: FloatArray, u: FloatArray, y: FloatArray) -> OnlineSample:
         """Take all rows of a record at once, as the first ones, and return the estimates after the last.
 
@@ -246,7 +246,7 @@ class OnlineEstimator:
         self._begin(t[0], u[0], y[0])
         state, covariance, lost = chain.step_rows(t, u, self._past, y, self._carried, self._settings)
         if lost:
-            raise _lost(float(t[lost]))
+            raise _refusal_of_rows(float(t[lost]))
         return self._filled_sample(float(t[-1]), state, covariance)
 
     def _begin(self, t: float, u: float, y: float) -> None:
@@ -303,7 +303,7 @@ class OnlineEstimator:
         )
 
 
-def _lost(t: float) -> IdentificationError:
+def _refusal_of_rows(t: float) -> IdentificationError:
     return IdentificationError(
         f"the delay estimate left the record at t = {t:g} s: lock was lost",
         remedy="start nearer to the delay, later, or with a lower rate; identify_delay finds a start",

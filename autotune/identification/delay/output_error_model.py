@@ -180,7 +180,7 @@ def colour_of(
     return noise_colour(rows[:, :-1], rows[:, -1], max_order)
 
 
-def widened(model: DelayModel, structure: Structure, colour: NoiseColour) -> DelayModel:
+def widen_intervals(model: DelayModel, structure: Structure, colour: NoiseColour) -> DelayModel:
     """Return the model with standard deviations that, 1.96 times, make Student's 95 % intervals.
 
     Parameters

@@ -40,7 +40,7 @@ class _Bins:
     y: FloatArray
 
 
-def binned(data: DelayData, bins: int) -> DelayData:
+def average_bins(data: DelayData, bins: int) -> DelayData:
     """Return the record averaged into bins: u exactly over each, held; y at the mean of its stamps.
 
     Parameters
@@ -116,7 +116,7 @@ def search(data: DelayData, structure: Structure, *, max_delay_s: float) -> list
     found: list[Candidate] = []
     while True:
         section = data if rows_per_bin * _BINS >= data.ty.size else _section(data, rows_per_bin * _BINS)
-        coarse = binned(section, _BINS)
+        coarse = average_bins(section, _BINS)
         points = _search_bins(coarse, structure, min(max_delay_s, 0.5 * section.duration_s))
         found += [Candidate(point=point, rows_per_bin=rows_per_bin) for point in points]
         if rows_per_bin == 1 or _energy_lost(section, coarse) < _ENERGY_LOST:

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import LinAlgError
 
 from autotune.arrays import ComplexArray, FloatArray
-from autotune.identification.delay.modulated_integrals import interpolated, running_fourier
+from autotune.identification.delay.modulated_integrals import interpolate, running_fourier
 
 #: (1 - cos 2 pi s)^2 as a sum of exponentials: three derivatives vanish at its ends.
 _WINDOW = ((-2, 0.25), (-1, -1.0), (0, 1.5), (1, -1.0), (2, 0.25))
@@ -203,7 +203,7 @@ class Windows:
         first = self.starts - shift_s
         parts = []
         for omega, sums in zip(self._omega, running, strict=True):
-            part = interpolated(t, sums, first + self.length_s) - interpolated(t, sums, first)
+            part = interpolate(t, sums, first + self.length_s) - interpolate(t, sums, first)
             parts.append(part * np.exp(-1j * omega * first))
         return self._combine(parts, derivative)
 

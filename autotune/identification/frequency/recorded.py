@@ -12,7 +12,7 @@ from autotune.errors import IdentificationError
 from autotune.identification.frequency.excitation import relay_segments
 from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
 from autotune.identification.frequency.spectral_points import FrequencyEstimate, points_of_spectra
-from autotune.identification.frequency.windows import noted_windows, windowed_cycles
+from autotune.identification.frequency.windows import estimate_cycles, read_noted_windows
 from autotune.identification.sweep_noted import estimate_again, is_noted
 from autotune.points import FrequencyPoint, as_pairs
 from autotune.recording import Recording
@@ -22,8 +22,8 @@ _RELAY_PART = 0.5  # of the recording that relay oscillations must fill
 
 def sessions(recordings: Sequence[Recording]) -> list[list[Recording]]:
     """Return the recordings in groups: those with an experiment's noted limit cycles together, every other alone."""
-    noted = [one for one in recordings if noted_windows(one)]
-    return ([noted] if noted else []) + [[one] for one in recordings if not noted_windows(one)]
+    noted = [one for one in recordings if read_noted_windows(one)]
+    return ([noted] if noted else []) + [[one] for one in recordings if not read_noted_windows(one)]
 
 
 def session_points(session: Sequence[Recording], *, largest_relative_sd: float = 0.5) -> FrequencyEstimate:
@@ -40,10 +40,10 @@ def session_points(session: Sequence[Recording], *, largest_relative_sd: float =
     largest_relative_sd : float
         Points with a larger standard deviation over their gain are left out.
     """
-    last = noted_windows(session[-1])
+    last = read_noted_windows(session[-1])
     if is_noted(session[-1].metadata, len(last)):  # a sitting before it was not gone on with
         session = session[-1:]
-    cycles = windowed_cycles([one for recording in session for one in noted_windows(recording)])
+    cycles = estimate_cycles([one for recording in session for one in read_noted_windows(recording)])
     if not cycles:
         return frequency_points(session[0], largest_relative_sd=largest_relative_sd)
     own = [cycle.points[0] for cycle in cycles]

@@ -18,7 +18,7 @@ from autotune.points import FrequencyPoint, as_pairs
 MOST = 240
 
 
-def thinned(points: Sequence[FrequencyPoint], most: int = MOST) -> tuple[FrequencyPoint, ...]:
+def thin_points(points: Sequence[FrequencyPoint], most: int = MOST) -> tuple[FrequencyPoint, ...]:
     """Return at most so many points, in ascending frequency; fewer than that are returned as they are.
 
     Parameters
@@ -79,7 +79,7 @@ def _mean(omega: FloatArray, response: ComplexArray, covariance: FloatArray, fir
     )
 
 
-def said(given: int, kept: int) -> tuple[str, ...]:
+def thinning_note(given: int, kept: int) -> tuple[str, ...]:
     """Return a note that points were thinned, none where they were not.
 
     Parameters

@@ -61,7 +61,7 @@ class Windowed:
         return limit_cycle_points(t[kept], u[kept], y[kept], window=self.window, known=known, highest_harmonic=highest)
 
 
-def windowed_cycles(cycles: Sequence[Windowed]) -> tuple[LimitCycle, ...]:
+def estimate_cycles(cycles: Sequence[Windowed]) -> tuple[LimitCycle, ...]:
     """Return every cycle's estimate, the others' points making its rough model: a function of the recorded rows alone.
 
     Parameters
@@ -85,7 +85,7 @@ def windowed_cycles(cycles: Sequence[Windowed]) -> tuple[LimitCycle, ...]:
     return tuple(found)
 
 
-def noted_windows(recording: Recording) -> tuple[Windowed, ...]:
+def read_noted_windows(recording: Recording) -> tuple[Windowed, ...]:
     """Return the limit cycles that an experiment noted in the recording's sidecar; none where it noted none."""
     tables = recording.metadata.get("relay")
     if not isinstance(tables, list):

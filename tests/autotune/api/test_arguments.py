@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from typing_extensions import TypeAliasType
 
 import autotune as at
-from autotune.arguments import checked
+from autotune.arguments import check_arguments
 from autotune.errors import AutotuneError, InputError
 from autotune.points import FrequencyPoint
 
@@ -159,6 +159,6 @@ def test_an_alias_stands_for_the_type_that_it_names() -> None:
         return float(values.max())
 
     largest.__annotations__["values"] = row_of_numbers
-    assert checked(largest)([1, 3, 2]) == 3.0
+    assert check_arguments(largest)([1, 3, 2]) == 3.0
     with pytest.raises(InputError, match="finite numbers in a row"):
-        checked(largest)("many")
+        check_arguments(largest)("many")

@@ -17,7 +17,7 @@ from autotune.equations import Drive, EquationModel, apply, compile_model, read_
 from autotune.equations.chain import from_chain
 from autotune.equations.exports import as_modelica, as_python, as_text
 from autotune.equations.files import read_any_model
-from autotune.equations.flatten import flattened
+from autotune.equations.flatten import flatten
 from autotune.equations.linearise import as_chain, linearise, transfer_function
 from autotune.equations.typeset import as_latex
 from autotune.errors import InputError
@@ -58,7 +58,7 @@ def y_of(one: EquationModel, t: np.ndarray = T, u: np.ndarray = U) -> np.ndarray
 
 
 def test_written_out_effects_are_the_same_model() -> None:
-    flat = flattened(EXTENDED)
+    flat = flatten(EXTENDED)
     assert not flat.effects
     assert not flat.ports
     np.testing.assert_allclose(y_of(flat), y_of(EXTENDED), atol=1e-8)
@@ -66,7 +66,7 @@ def test_written_out_effects_are_the_same_model() -> None:
 
 def test_what_acts_on_samples_is_not_written_out_in_silence() -> None:
     with pytest.raises(InputError, match="no differential equation"):
-        flattened(replace(model(), effects=(effect("sensor.quantisation", step=0.1),)))
+        flatten(replace(model(), effects=(effect("sensor.quantisation", step=0.1),)))
 
 
 def test_the_python_function_integrates_to_the_same(tmp_path: Path) -> None:

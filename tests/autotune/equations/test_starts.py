@@ -8,7 +8,7 @@ import pytest
 from autotune.arrays import FloatArray
 from autotune.equations import Compiled, Drive, compile_model, simulate
 from autotune.equations.sensitivity import Windows
-from autotune.equations.starts import fitted_starts
+from autotune.equations.starts import fit_starts
 from tests.autotune.equations.models import model
 
 ROWS = 1200
@@ -31,7 +31,7 @@ def test_a_window_takes_over_the_state_that_a_fit_on_other_windows_knows() -> No
     starts = np.array([0, 130, 260, 399, 700])
     stops = np.append(starts[1:], ROWS)
     p = compiled.parameter_vector
-    found = fitted_starts(compiled, p, drive, y, np.isfinite(y), starts, stops, known=known)
+    found = fit_starts(compiled, p, drive, y, np.isfinite(y), starts, stops, known=known)
     np.testing.assert_allclose(found.states[:4], states[starts[:4]], atol=1e-4)
     np.testing.assert_allclose(found.states[4], states[700], atol=1e-2)  # nobody knows it: the readings tell
 
@@ -45,6 +45,6 @@ def test_starts_keep_to_the_swing_of_the_readings_where_wrong_numbers_lead_a_sim
     strays = y - simulate(compiled, p, drive, states[starts], starts=starts, stops=stops).y
     assert np.max(np.abs(strays)) > np.pi  # another swing than the readings'
     first = Windows(starts=np.array([0]), stops=np.array([1]), states=states[:1])
-    found = fitted_starts(compiled, p, drive, y, np.isfinite(y), starts, stops, known=first)
+    found = fit_starts(compiled, p, drive, y, np.isfinite(y), starts, stops, known=first)
     spread = np.ptp(states, axis=0)
     assert np.all(np.abs(found.states - states[starts]) < 0.1 * spread)

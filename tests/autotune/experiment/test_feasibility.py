@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from autotune.experiment.feasibility import supported_rad_s
+from autotune.experiment.feasibility import highest_frequency_rad_s
 from autotune.experiment.loop import Timing
 from autotune.experiment.rig import Reading
 from autotune.experiment.run import run_experiment
@@ -21,15 +21,15 @@ NO_LATENCY = Timing(latency_s=(0.0, 0.0, 0.0), lateness_s=(0.0, 0.0, 0.0), misse
 
 def test_the_dead_time_that_a_latency_hides_is_a_phase_error_at_the_supported_frequency() -> None:
     slow = replace(NO_LATENCY, latency_s=(2e-3, 2e-3, 2e-3))
-    omega = supported_rad_s(slow, 0.01, 0.004, exact=False)
+    omega = highest_frequency_rad_s(slow, 0.01, 0.004, exact=False)
     assert omega * 2e-3 == pytest.approx(0.004)
-    assert supported_rad_s(replace(slow, latency_s=(2e-3, 8e-3, 9e-3)), 0.01, 0.004, exact=False) < omega
-    assert supported_rad_s(slow, 0.01, 0.004, exact=True) > 10.0 * omega
+    assert highest_frequency_rad_s(replace(slow, latency_s=(2e-3, 8e-3, 9e-3)), 0.01, 0.004, exact=False) < omega
+    assert highest_frequency_rad_s(slow, 0.01, 0.004, exact=True) > 10.0 * omega
 
 
 @pytest.mark.parametrize("timing", [NO_LATENCY, replace(NO_LATENCY, latency_s=(math.nan, math.nan, math.nan))])
 def test_without_latency_the_samples_of_a_period_are_the_limit(timing: Timing) -> None:
-    assert supported_rad_s(timing, 0.01, 0.004, exact=False) == pytest.approx(2.0 * math.pi / 0.08)
+    assert highest_frequency_rad_s(timing, 0.01, 0.004, exact=False) == pytest.approx(2.0 * math.pi / 0.08)
 
 
 class LateRig(SimulatedRig):

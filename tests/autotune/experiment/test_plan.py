@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from autotune.errors import IdentificationError
-from autotune.experiment.local_model import LocalModel, predicted
+from autotune.experiment.local_model import LocalModel, predict_crossing
 from autotune.experiment.plan import Choice, Goal, allot, choose, expected_sd, phase_targets, time_s, within_reach
 from autotune.experiment.relay import RelaySettings
 from autotune.models import TransferFunction
@@ -40,13 +40,13 @@ def test_targets_lie_within_the_wanted_phases_the_most_lagging_first(count: int,
 def test_from_one_point_the_next_frequency_is_foreseen_well_enough_to_stay_in_the_wanted_range(
     omega: float, phase_deg: float
 ) -> None:
-    foreseen, _ = predicted(known(omega), -1, math.radians(phase_deg))
+    foreseen, _ = predict_crossing(known(omega), -1, math.radians(phase_deg))
     reached = np.degrees(np.angle(-linear_ball().response(np.array([foreseen]))))[0]
     assert reached == pytest.approx(phase_deg, abs=14.0)
 
 
 def test_between_known_points_the_frequency_is_foreseen_to_one_degree() -> None:
-    foreseen, model = predicted(known(1.0, 1.5, 2.3, 3.5, 5.0), -1, math.radians(-138.0))
+    foreseen, model = predict_crossing(known(1.0, 1.5, 2.3, 3.5, 5.0), -1, math.radians(-138.0))
     truth = linear_ball().response(np.array([foreseen]))[0]
     assert math.degrees(np.angle(-truth)) == pytest.approx(-138.0, abs=1.0)
     assert model.gain(foreseen) == pytest.approx(abs(truth), rel=0.05)
@@ -74,7 +74,7 @@ def test_the_relays_lag_of_an_integrator_is_a_quarter_period_when_nothing_else_d
 def test_a_plant_that_does_not_lag_is_refused() -> None:
     leading = FrequencyPoint(omega_rad_s=1.0, response=1.0 + 0.1j, covariance=NO_DOUBT)
     with pytest.raises(IdentificationError, match="between -90 and -180"):
-        predicted([leading], 1, math.radians(-120.0))
+        predict_crossing([leading], 1, math.radians(-120.0))
 
 
 def points_of(plant: TransferFunction, *omegas: float) -> list[FrequencyPoint]:
@@ -92,7 +92,7 @@ def test_one_lag_is_measured_where_its_phases_are() -> None:
     assert math.degrees(np.angle(first[0].response)) == pytest.approx(low)
     assert -60.0 < high < -30.0
     for phase_deg in (high, 0.5 * (high + low)):
-        foreseen, model = predicted(first, 1, math.radians(phase_deg))
+        foreseen, model = predict_crossing(first, 1, math.radians(phase_deg))
         truth = lag.response(np.array([foreseen]))[0]
         assert math.degrees(np.angle(truth)) == pytest.approx(phase_deg, abs=0.1)
         assert model.gain(foreseen) == pytest.approx(abs(truth), rel=0.02)
@@ -104,7 +104,7 @@ def test_where_one_point_is_known_the_gain_is_foreseen_rather_too_large() -> Non
     lag = TransferFunction(num=(0.5,), den=(2.0, 1.0), delay_s=6.0)
     first = points_of(lag, 0.3)
     for phase_deg in (-155.0, -150.0, -145.0):
-        foreseen, model = predicted(first, 1, math.radians(phase_deg))
+        foreseen, model = predict_crossing(first, 1, math.radians(phase_deg))
         assert foreseen > 0.3
         assert model.gain(foreseen) >= abs(lag.response(np.array([foreseen]))[0])
 
@@ -142,5 +142,5 @@ def test_one_lag_far_above_its_corner_is_one_lag_though_noise_turns_its_phase(no
     response = TransferFunction(num=(2.0,), den=(1.0, 1.0)).response(np.array([omega]))[0]
     turned = abs(response) * np.exp(-1j * math.radians(90.0 + noise_deg))
     first = FrequencyPoint(omega_rad_s=omega, response=complex(turned), covariance=NO_DOUBT)
-    foreseen, _ = predicted([first], 1, math.radians(-70.0))
+    foreseen, _ = predict_crossing([first], 1, math.radians(-70.0))
     assert 1.0 / 3.0 < foreseen / math.tan(math.radians(70.0)) < 5.0

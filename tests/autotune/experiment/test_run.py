@@ -294,13 +294,13 @@ def test_all_cycles_are_estimated_together_once_the_rig_is_safe(
 ) -> None:
     """That takes as long as many samples: in the open loop it was a link too slow."""
     rig, held = ball_rig(seed=7), []
-    real = run.refined
+    real = run.refine_cycles
 
     def looked(*given: Any) -> Any:
         held.append(rig.command)
         return real(*given)
 
-    monkeypatch.setattr(run, "refined", looked)
+    monkeypatch.setattr(run, "refine_cycles", looked)
     run_experiment(rig, ball_config(), tmp_path / "recording.csv")
     assert held == [0.0]
 

@@ -28,7 +28,7 @@ from autotune.experiment.together import WORTH, Found
 from autotune.identification.envelope import polar_sd
 from autotune.identification.frequency.recorded import session_points
 from autotune.identification.sweep_estimate import SweepEstimate
-from autotune.pipeline.measured import measured_of
+from autotune.pipeline.measured import measure_plant
 from autotune.pipeline.swept import price_of
 from autotune.recording import read_recording
 from drivers.simulated import SimulatedRig
@@ -104,7 +104,7 @@ def test_a_sweep_that_was_stopped_with_few_points_tells_of_the_plant_by_its_rows
     rig, path = ball_rig(seed=7), tmp_path / "stopped.csv"
     with pytest.raises(ExperimentStopped, match="time over"):
         run_experiment(rig, ball_config(limits={"time_s": 30.0}), path)
-    found = measured_of([read_recording(path)])
+    found = measure_plant([read_recording(path)])
     assert len(found.points) < 3
     assert found.fit is not None
     omega = np.array([1.5, 2.5, 4.0])

@@ -14,7 +14,7 @@ from autotune.config import load_config
 from autotune.config.rig import SerialSettings
 from autotune.controller import PIDController
 from autotune.errors import DesignError, ExperimentStopped
-from autotune.experiment.judgement import Verification, expectation, judge, require_predictable, smoothed
+from autotune.experiment.judgement import Verification, expectation, judge, require_predictable, smooth_steps
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.run import envelope_of
 from autotune.experiment.step_test import StepTest, plan_test
@@ -60,7 +60,7 @@ def test_the_steps_stay_within_half_of_the_swing() -> None:
     assert isinstance(TEST, StepTest)
     assert TEST.setpoint.max() <= CONFIG.limits.swing / 2
     y, _ = measured(BALL, 0)
-    assert np.abs(smoothed(y - TEST.setpoint, TEST)).max() < 0.5 * CONFIG.limits.swing
+    assert np.abs(smooth_steps(y - TEST.setpoint, TEST)).max() < 0.5 * CONFIG.limits.swing
     assert quiet.size == TEST.t.size
 
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from autotune.arrays import FloatArray
 from autotune.identification.closed_loop.confidence import response_covariance
-from autotune.identification.closed_loop.gaps import LONGEST, bridged, usable_stretch, usable_stretches
+from autotune.identification.closed_loop.gaps import LONGEST, bridge_gaps, usable_stretch, usable_stretches
 from autotune.identification.closed_loop.identify import identify_closed_loop
-from autotune.identification.closed_loop.order import choose_order, fixed_order
+from autotune.identification.closed_loop.order import choose_order, fit_order
 from autotune.identification.closed_loop.state_space import InnovationModel
 from autotune.recording import Recording
 from tests.autotune.identification.test_closed_loop import DT, ball_loop
@@ -52,11 +52,11 @@ def test_a_record_with_gaps_gives_the_plant_that_the_whole_record_gives(late: bo
 def test_the_command_over_a_gap_is_what_was_held() -> None:
     t = np.array([0.0, 1.0, 2.0, 5.0, 6.0, 7.0])
     u = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    found = bridged(Recording(t=t, u=u, y=10.0 * t), 0.25)
+    found = bridge_gaps(Recording(t=t, u=u, y=10.0 * t), 0.25)
     assert found.gaps == 0  # two of six rows: what is put in would speak for the plant
     rows = np.arange(60.0)
     sparse = np.delete(rows, [20, 21])
-    found = bridged(Recording(t=sparse, u=sparse, y=10.0 * sparse), 0.25)
+    found = bridge_gaps(Recording(t=sparse, u=sparse, y=10.0 * sparse), 0.25)
     assert (found.gaps, found.rows) == (1, 2)
     assert found.recording.t == pytest.approx(rows)
     assert found.recording.u[18:24] == pytest.approx([18.0, 19.0, 19.0, 19.0, 22.0, 23.0])
@@ -67,7 +67,7 @@ def test_a_sample_that_came_late_counts_by_the_time_its_command_acted() -> None:
     rows = np.arange(60.0)
     late = rows.copy()
     late[20] += 0.4
-    found = bridged(Recording(t=late, u=rows, y=10.0 * rows), 0.25)
+    found = bridge_gaps(Recording(t=late, u=rows, y=10.0 * rows), 0.25)
     assert (found.gaps, found.rows) == (1, 1)
     assert found.recording.u[19:22] == pytest.approx([19.0, 0.4 * 19.0 + 0.6 * 20.0, 21.0])
 
@@ -75,7 +75,7 @@ def test_a_sample_that_came_late_counts_by_the_time_its_command_acted() -> None:
 def test_a_long_gap_still_cuts_the_record() -> None:
     t = np.arange(200.0) + np.where(np.arange(200) > 120, 20.0, 0.0)
     recording = Recording(t=t, u=np.sin(t), y=np.cos(t))
-    assert bridged(recording, 0.25).recording is recording
+    assert bridge_gaps(recording, 0.25).recording is recording
     assert len(usable_stretch(recording)[0]) == 121
 
 
@@ -141,7 +141,7 @@ def test_with_gaps_the_regions_cover_and_the_order_is_found() -> None:
         kept = np.concatenate(
             [np.arange(a, b) for a, b in ((0, 400), (420, 720), (800, 1600), (1700, 1760), (1800, 2000))]
         )
-        estimate = fixed_order(u[kept], y[kept], 2, starts=starts)
+        estimate = fit_order(u[kept], y[kept], 2, starts=starts)
         omega = np.geomspace(0.05, 2.0, 6)
         error = estimate.model.response(omega)[:, 0, 0] - TRUE.response(omega)[:, 0, 0]
         inside.append(inside_region(error, response_covariance(estimate, omega)[:, 0, 0]))

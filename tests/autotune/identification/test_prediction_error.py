@@ -18,7 +18,7 @@ from autotune.identification.closed_loop.confidence import (
     whiteness,
 )
 from autotune.identification.closed_loop.lagged import lagged_factor, lagged_range, lagged_rows
-from autotune.identification.closed_loop.order import choose_order, fixed_order
+from autotune.identification.closed_loop.order import choose_order, fit_order
 from autotune.identification.closed_loop.prediction_error import prediction_error
 from autotune.identification.closed_loop.predictor_directions import Predictor, behaviour_directions
 from autotune.identification.closed_loop.predictor_sweep import innovations, normal_equations
@@ -63,8 +63,8 @@ def test_derivatives_agree_with_differences(n: int, n_u: int, n_y: int, offset: 
     every = np.eye(p.F.shape[1])
     total = normal_equations(p.F, p.H, p.x0, u, y, every, directions, np.eye(n_y))
     step = 1e-6
-    ahead = [_errors(p.moved(step * column, directions), u, y).ravel() for column in np.eye(P)]
-    behind = [_errors(p.moved(-step * column, directions), u, y).ravel() for column in np.eye(P)]
+    ahead = [_errors(p.move_along(step * column, directions), u, y).ravel() for column in np.eye(P)]
+    behind = [_errors(p.move_along(-step * column, directions), u, y).ravel() for column in np.eye(P)]
     J = (np.array(ahead) - np.array(behind)).T / (2.0 * step)
     scale = np.max(np.abs(total))
     np.testing.assert_allclose(total[:-1, :-1], J.T @ J, atol=1e-5 * scale)
@@ -85,7 +85,7 @@ def test_blockwise_factor_has_the_lagged_products_about_the_means(rows: int, lag
 
 def test_default_is_exact_without_noise() -> None:
     d = example_set(11, sd=0.0)
-    num, den = fixed_order(d.u, d.y, 5).model.polynomials()
+    num, den = fit_order(d.u, d.y, 5).model.polynomials()
     np.testing.assert_allclose(den, PLANT_DEN, atol=1e-8)
     np.testing.assert_allclose(num, PLANT_NUM, atol=1e-9)
 
@@ -97,7 +97,7 @@ def test_default_sits_on_the_cramer_rao_bound_with_true_regions_and_stabilised_m
     truth = PLANT.response(OMEGA)
     for seed in range(count):
         d = example_set(seed)
-        estimate = fixed_order(d.u, d.y, 5)
+        estimate = fit_order(d.u, d.y, 5)
         assert estimate.converged
         assert spectral_radius(feedback(estimate.model, CONTROLLER).A) < 1.0
         at = [int(np.argmin(np.abs(estimate.model.poles - pole))) for pole in poles]
@@ -166,14 +166,14 @@ def test_dead_time_is_named_instead_of_a_chain_of_states() -> None:
 
 def test_operating_point_and_units_do_not_matter() -> None:
     d = example_set(15)
-    here = fixed_order(d.u - 5.0, 1e-3 * (d.y + 30.0), 5).model
-    there = fixed_order(d.u + 40.0, d.y - 7.0, 5).model
+    here = fit_order(d.u - 5.0, 1e-3 * (d.y + 30.0), 5).model
+    there = fit_order(d.u + 40.0, d.y - 7.0, 5).model
     np.testing.assert_allclose(1e3 * here.response(OMEGA), there.response(OMEGA), rtol=2e-3)
 
 
 def test_constant_is_estimated_where_the_data_ask_for_one_only() -> None:
     d = example_set(15)
-    centred, loaded = fixed_order(d.u, d.y, 5), fixed_order(d.u + 0.2, d.y, 5)
+    centred, loaded = fit_order(d.u, d.y, 5), fit_order(d.u + 0.2, d.y, 5)
     assert np.all(centred.offset_x == 0.0)
     assert np.all(centred.offset_y == 0.0)
     assert loaded.parameters == centred.parameters + 1
@@ -189,13 +189,13 @@ def test_constant_is_estimated_where_the_data_ask_for_one_only() -> None:
 def test_stray_mean_of_a_slow_loop_is_no_operating_point() -> None:
     d = example_set(180)
     assert abs(d.y.mean()) > 0.2 * d.y.std()  # zero in the long run
-    found, without = fixed_order(d.u, d.y, 5), fixed_order(d.u, d.y, 5, offset=False)
+    found, without = fit_order(d.u, d.y, 5), fit_order(d.u, d.y, 5, offset=False)
     np.testing.assert_allclose(found.model.poles, without.model.poles, rtol=1e-6)
 
 
 def test_residuals_are_white_at_the_right_order_only() -> None:
     d = example_set(16)
-    low, right = fixed_order(d.u, d.y, 3), fixed_order(d.u, d.y, 5)
+    low, right = fit_order(d.u, d.y, 3), fit_order(d.u, d.y, 5)
     assert whiteness(low, residuals(low, d.u, d.y)).probability < 1e-6
     assert whiteness(right, residuals(right, d.u, d.y)).probability > 1e-3
 
@@ -203,4 +203,4 @@ def test_residuals_are_white_at_the_right_order_only() -> None:
 def test_too_few_rows_are_refused() -> None:
     d = example_set(17)
     with pytest.raises(IdentificationError, match=r"too short|longer future window"):
-        fixed_order(d.u[:18], d.y[:18], 5)
+        fit_order(d.u[:18], d.y[:18], 5)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autotune.identification.frequency.thinning import MOST, thinned
+from autotune.identification.frequency.thinning import MOST, thin_points
 from autotune.points import FrequencyPoint
 
 
@@ -22,13 +22,13 @@ def spectrum(count: int, sd: float, seed: int = 0) -> list[FrequencyPoint]:
 
 def test_few_points_stay_as_they_are() -> None:
     points = spectrum(MOST, 0.01)
-    assert thinned(points) == tuple(points)
+    assert thin_points(points) == tuple(points)
 
 
 @pytest.mark.parametrize("count", [1_000, 30_000])
 def test_the_information_is_kept_and_the_mean_is_where_the_plant_is(count: int) -> None:
     points = spectrum(count, 0.05)
-    few = thinned(points)
+    few = thin_points(points)
     assert len(few) <= MOST
     information = sum(np.linalg.inv(np.array(point.covariance)).trace() for point in points)
     kept = sum(np.linalg.inv(np.array(point.covariance)).trace() for point in few)
@@ -47,6 +47,6 @@ def test_a_resonance_narrower_than_a_band_widens_its_region() -> None:
         FrequencyPoint(omega_rad_s=float(w), response=complex(v), covariance=((1e-4, 0.0), (0.0, 1e-4)))
         for w, v in zip(omega, g, strict=True)
     ]
-    few = thinned(sharp, 10)
+    few = thin_points(sharp, 10)
     nearest = min(few, key=lambda point: abs(point.omega_rad_s - 1.0))
     assert nearest.covariance[0][0] > 1e3 * 1e-4 / 400

@@ -20,7 +20,7 @@ from autotune.effects import ALL, CATALOGUE, kind_of
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.report.chain_diagram import chain_diagram
 from autotune.report.diagnosis_page import write_diagnosis_page
-from autotune.report.effect_words import clause, joined, number, of_candidate, with_spread
+from autotune.report.effect_words import clause, join_clauses, number, of_candidate, with_spread
 from autotune.report.investigation_page import list_candidates
 from autotune.report.law_figures import file_names
 from tests.autotune.diagnosis.servo_rigs import GAIN, servo_model, servo_recording
@@ -137,7 +137,7 @@ def test_rivals_are_told_in_words_with_their_names() -> None:
     said = of_candidate("plant.coulomb_friction+actuator.lag")
     assert said.startswith(clause("plant.coulomb_friction"))
     assert said.endswith("(plant.coulomb_friction + actuator.lag)")
-    assert joined(["a", "b", "c"]) == "a, b and c"
+    assert join_clauses(["a", "b", "c"]) == "a, b and c"
 
 
 def test_beside_an_effect_that_no_hypothesis_has_nothing_else_is_missing() -> None:

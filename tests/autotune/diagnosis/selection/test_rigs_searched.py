@@ -17,7 +17,7 @@ from autotune.diagnosis.selection.judged_chain import JudgedChain, at_both_scale
 from autotune.diagnosis.selection.prediction import extend
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE
-from autotune.effects import ALL, taken_by
+from autotune.effects import ALL, related_effects
 from autotune.effects.rigs import rig_kind
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.recording import Recording
@@ -79,8 +79,8 @@ def test_the_extended_model_has_what_is_named_and_nothing_else():
 def test_dry_friction_that_drops_with_speed_is_not_added_beside_plain_dry_friction():
     laws = {"plant.coulomb_friction", "plant.stribeck_friction"}
     for law in laws:
-        assert taken_by([law, "actuator.lag"]) >= {*laws, "actuator.lag"}
-    assert "plant.hysteresis" in taken_by(["plant.coulomb_friction"])  # dry friction where its width is 0
+        assert related_effects([law, "actuator.lag"]) >= {*laws, "actuator.lag"}
+    assert "plant.hysteresis" in related_effects(["plant.coulomb_friction"])  # dry friction where its width is 0
 
 
 def test_a_linear_oscillation_is_given_no_effect():
