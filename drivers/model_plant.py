@@ -86,35 +86,20 @@ class ModelPlant:
         self._others = [one.offset for one in model.inputs[1:]]
         self._noise, self._resolution = noise, resolution
         self._random = np.random.default_rng((seed, 2))
-        self._time_s = 0.0
+        self.time_s = 0.0
         given = np.array([0.0 if state.start is None else state.start for state in model.states])
-        self._u_rest = model.inputs[0].offset
+        self.u_rest = model.inputs[0].offset
         rest = self._rest(u_start, given)
         self._states = given if rest is None else rest
-        self._u = self._u_rest if rest is None else u_start
+        self.u_applied = self.u_rest if rest is None else u_start
         self._delay_s = model.inputs[0].delay_s
         # when each command began to be held; the first for ever before
-        self._held: deque[tuple[float, float]] = deque([(-math.inf, self._u)])
-
-    @property
-    def time_s(self) -> float:
-        """Time the plant has lived [s]."""
-        return self._time_s
-
-    @property
-    def u_applied(self) -> float:
-        """Command it holds [u unit]."""
-        return self._u
-
-    @property
-    def u_rest(self) -> float:
-        """Truth: the model's own offset of the command [u unit]."""
-        return self._u_rest
+        self._held: deque[tuple[float, float]] = deque([(-math.inf, self.u_applied)])
 
     @property
     def y_true(self) -> float:
         """Truth: the output before noise [y unit]."""
-        return self._look(self._states, self._acting(self._time_s))[1]
+        return self._look(self._states, self._acting(self.time_s))[1]
 
     def advance(self, u: float, dt_s: float) -> None:
         """Hold a command for a time.
@@ -131,16 +116,16 @@ class ModelPlant:
         InputError
             The model runs away.
         """
-        if u != self._u:
-            self._held.append((self._time_s, u))
-            self._u = u
-        end_s = self._time_s + dt_s
-        while self._time_s < end_s:
+        if u != self.u_applied:
+            self._held.append((self.time_s, u))
+            self.u_applied = u
+        end_s = self.time_s + dt_s
+        while self.time_s < end_s:
             # until the next command has come through the dead time
             turns = (since_s + self._delay_s for since_s, _ in self._held)
-            until_s = min((at for at in turns if at > self._time_s), default=math.inf)
-            self._run(self._acting(self._time_s), min(until_s, end_s))
-        while len(self._held) > 1 and self._held[1][0] + self._delay_s <= self._time_s:
+            until_s = min((at for at in turns if at > self.time_s), default=math.inf)
+            self._run(self._acting(self.time_s), min(until_s, end_s))
+        while len(self._held) > 1 and self._held[1][0] + self._delay_s <= self.time_s:
             self._held.popleft()
 
     def measure(self) -> float:
@@ -150,7 +135,7 @@ class ModelPlant:
 
     def response(self, omega_rad_s: FloatArray) -> ComplexArray:
         """Truth: complex gain at rest under the command, same shape as ``omega_rad_s``; integrating: at the output."""
-        inputs = np.array([self._acting(self._time_s), *self._others])
+        inputs = np.array([self._acting(self.time_s), *self._others])
         try:
             at = linearise(self._model, inputs)
         except InputError:
@@ -163,16 +148,16 @@ class ModelPlant:
 
     def _run(self, u: float, until_s: float) -> None:
         inputs = np.array([[u, *self._others]] * 2)
-        drive = Drive(t=np.array([self._time_s, until_s]), inputs=inputs)
+        drive = Drive(t=np.array([self.time_s, until_s]), inputs=inputs)
         if not drive.t[1] > drive.t[0]:
             return
         run = simulate(self._compiled, self._parameters, drive, self._states, delays=np.zeros(len(self._model.inputs)))
         self._states = require_complete(run, self._compiled, "twin").ends[0]
-        self._time_s = until_s
+        self.time_s = until_s
 
     def _look(self, states: FloatArray, u: float) -> tuple[FloatArray, float]:
         slopes, outputs = derivatives(
-            self._compiled, self._parameters, states[None, :], np.array([[u, *self._others]]), self._time_s
+            self._compiled, self._parameters, states[None, :], np.array([[u, *self._others]]), self.time_s
         )
         return slopes[0], float(outputs[0, 0])
 

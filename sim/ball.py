@@ -101,20 +101,10 @@ class Ball:
         grounded = settings.ends and settings.start == FLOOR
         flow = -settings.hover if grounded else 0.0
         self._x = np.array([flow, 0.0, settings.start, settings.start])
-        self._u_applied = 0.0 if grounded else settings.hover
-        self._time_s = 0.0
+        self.u_applied = 0.0 if grounded else settings.hover
+        self.time_s = 0.0
         self._random = np.random.default_rng((seed, 2))
         self._noise: list[float] = []
-
-    @property
-    def time_s(self) -> float:
-        """Time the plant has lived [s]."""
-        return self._time_s
-
-    @property
-    def u_applied(self) -> float:
-        """Voltage at the turbine, after converter and saturation [V]."""
-        return self._u_applied
 
     @property
     def u_rest(self) -> float:
@@ -141,9 +131,9 @@ class Ball:
         dt_s : float
             How long [s].
         """
-        self._u_applied = self._convert(u)
-        _advance(self._x, self._u_applied - self.settings.hover, dt_s, self.settings.ends)
-        self._time_s += dt_s
+        self.u_applied = self._convert(u)
+        _advance(self._x, self.u_applied - self.settings.hover, dt_s, self.settings.ends)
+        self.time_s += dt_s
 
     def measure(self) -> float:
         """Return one sonar reading [V]."""

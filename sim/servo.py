@@ -82,19 +82,9 @@ class Servo:
         )
         self._turned = settings.start
         self._lags = [0.0, 0.0, 0.0]
-        self._u_applied = settings.load
-        self._time_s = 0.0
+        self.u_applied = settings.load
+        self.time_s = 0.0
         self._random = np.random.default_rng((seed, 2))
-
-    @property
-    def time_s(self) -> float:
-        """Time the plant has lived [s]."""
-        return self._time_s
-
-    @property
-    def u_applied(self) -> float:
-        """Voltage after the amplifier's saturation [V]."""
-        return self._u_applied
 
     @property
     def u_rest(self) -> float:
@@ -117,13 +107,13 @@ class Servo:
             How long [s].
         """
         limit = self.settings.u_max
-        self._u_applied = min(max(u, -limit), limit)
-        net = self._u_applied - self.settings.load
+        self.u_applied = min(max(u, -limit), limit)
+        net = self.u_applied - self.settings.load
         self._turned += self.settings.gain * net * dt_s
         for i, (rate, residue) in enumerate(zip(self._rates, self._residues, strict=True)):
             decay = math.exp(rate * dt_s)
             self._lags[i] = decay * self._lags[i] + residue * net * (1.0 - decay)
-        self._time_s += dt_s
+        self.time_s += dt_s
 
     def measure(self) -> float:
         """Return one encoder reading [rad]."""

@@ -144,19 +144,9 @@ class TwoTank:
         self.settings = settings
         rest = self._holding(settings.start)
         self._x = np.array([rest, settings.start, settings.start, settings.start])
-        self._u_applied = rest
-        self._time_s = 0.0
+        self.u_applied = rest
+        self.time_s = 0.0
         self._random = np.random.default_rng((seed, 2))
-
-    @property
-    def time_s(self) -> float:
-        """Time the plant has lived [s]."""
-        return self._time_s
-
-    @property
-    def u_applied(self) -> float:
-        """Pump voltage after saturation at 0 and 10 V [V]."""
-        return self._u_applied
 
     @property
     def u_rest(self) -> float:
@@ -178,11 +168,11 @@ class TwoTank:
         dt_s : float
             How long [s].
         """
-        self._u_applied = min(max(u, 0.0), _U_MAX["tanks"])
+        self.u_applied = min(max(u, 0.0), _U_MAX["tanks"])
         p = self.settings
         constants = np.array([p.area, p.outlet, p.pump, p.tau_pump, p.tau_sensor, p.height])
-        _fill(self._x, self._u_applied, dt_s, constants)
-        self._time_s += dt_s
+        _fill(self._x, self.u_applied, dt_s, constants)
+        self.time_s += dt_s
 
     def measure(self) -> float:
         """Return one level reading [cm]."""
@@ -207,20 +197,10 @@ class Heater:
     def __init__(self, settings: HeaterSettings, *, seed: int = 0, warm: bool = False) -> None:
         self.settings = settings
         T = settings.target if warm else settings.ambient
-        self._u_applied = self._holding(T)
-        self._x = np.array([self._u_applied, T + _ZERO_C, T + _ZERO_C])
-        self._time_s = 0.0
+        self.u_applied = self._holding(T)
+        self._x = np.array([self.u_applied, T + _ZERO_C, T + _ZERO_C])
+        self.time_s = 0.0
         self._random = np.random.default_rng((seed, 2))
-
-    @property
-    def time_s(self) -> float:
-        """Time the plant has lived [s]."""
-        return self._time_s
-
-    @property
-    def u_applied(self) -> float:
-        """Heater power after saturation at 0 and 100 % [%]."""
-        return self._u_applied
 
     @property
     def u_rest(self) -> float:
@@ -242,12 +222,12 @@ class Heater:
         dt_s : float
             How long [s].
         """
-        self._u_applied = min(max(u, 0.0), _U_MAX["heater"])
+        self.u_applied = min(max(u, 0.0), _U_MAX["heater"])
         p = self.settings
         radiation = p.emissivity * _STEFAN_BOLTZMANN * p.surface
         constants = np.array([p.capacity, p.power, p.loss, radiation, p.tau_sensor, p.tau_element, p.ambient + _ZERO_C])
-        _heat(self._x, self._u_applied, dt_s, constants)
-        self._time_s += dt_s
+        _heat(self._x, self.u_applied, dt_s, constants)
+        self.time_s += dt_s
 
     def measure(self) -> float:
         """Return one temperature reading [degC]."""

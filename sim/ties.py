@@ -94,23 +94,9 @@ class Servo:
 
     def __init__(self, left_out: str, size: float, seed: int) -> None:
         self._left_out, self._size = left_out, size
-        self._v = self._x = self._play = self._u = self._t = 0.0
+        self._v = self._x = self._play = 0.0
+        self.time_s = self.u_applied = self.u_rest = 0.0
         self._random = np.random.default_rng(seed)
-
-    @property
-    def time_s(self) -> float:
-        """Time the plant has lived [s]."""
-        return self._t
-
-    @property
-    def u_applied(self) -> float:
-        """Command that it holds [V]."""
-        return self._u
-
-    @property
-    def u_rest(self) -> float:
-        """Truth: command at rest [V]."""
-        return 0.0
 
     @property
     def y_true(self) -> float:
@@ -127,14 +113,14 @@ class Servo:
         dt_s : float
             How long [s].
         """
-        self._u = u
+        self.u_applied = u
         steps = max(1, round(dt_s / 0.002))
         faded = math.exp(-dt_s / steps / TAU)
         for _ in range(steps):
             rest = GAIN * self._push(u)
             self._x += rest * dt_s / steps + (self._v - rest) * TAU * (1.0 - faded)
             self._v = rest + (self._v - rest) * faded
-        self._t += dt_s
+        self.time_s += dt_s
 
     def _push(self, u: float) -> float:
         c, v, x = self._size, self._v, self._x

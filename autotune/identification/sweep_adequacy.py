@@ -61,9 +61,8 @@ def _offset_and_drift(t: FloatArray, inside: Any) -> list[FloatArray]:
 
 
 def _sensitivities(data: DelayData, found: Fitted) -> FloatArray:
-    at, before = found.point, 0.0 if data.before is None else data.before
-    all_of_them = sensitivities(data.tu, data.u, before, data.linear, data.ty, at.a, at.h, at.theta)
-    return np.asarray(all_of_them[:, found.structure.free])
+    at = found.point
+    return np.asarray(sensitivities(data, at.a, at.h, at.theta)[:, found.structure.free])
 
 
 def colour_beside(data: DelayData, found: Fitted, columns: FloatArray) -> FloatArray:

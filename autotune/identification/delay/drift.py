@@ -57,7 +57,7 @@ def mean_over_window(data: DelayData, structure: Structure, model: DelayModel) -
     levels, moving = _sensitivities(usable, structure, model, point.theta)
     middle, half = 0.5 * (usable.ty[0] + usable.ty[-1]), 0.5 * (usable.ty[-1] - usable.ty[0])
     slopes = levels[:, moving] * ((usable.ty - middle) / half)[:, None]
-    errors = usable.y - _response(usable, model.a, model.delay_s, point.theta)
+    errors = usable.y - output(usable, model.a, model.delay_s, point.theta)
     colour = np.concatenate([[1.0], whitening])
     filtered = lfilter(colour, [1.0], np.column_stack([levels, slopes, errors]), axis=0)[whitening.size :]
     scale = np.linalg.norm(filtered, axis=0) + 1e-300
@@ -75,11 +75,6 @@ def mean_over_window(data: DelayData, structure: Structure, model: DelayModel) -
     return _with(model, structure, moving, step, joint, moved=moved)
 
 
-def _response(data: DelayData, a: tuple[float, ...], h: float, theta: FloatArray) -> FloatArray:
-    before = 0.0 if data.before is None else data.before
-    return np.asarray(output(data.tu, data.u, before, data.linear, data.ty, a, h, theta), dtype=np.float64)
-
-
 def _sensitivities(
     data: DelayData, structure: Structure, model: DelayModel, theta: FloatArray
 ) -> tuple[FloatArray, list[int]]:
@@ -89,22 +84,22 @@ def _sensitivities(
     columns: list[FloatArray] = []
     for i in range(int(structure.integrator), n):
         ends = [
-            _response(data, (*model.a[:i], model.a[i] + s * _STEP * sd[i], *model.a[i + 1 :]), model.delay_s, theta)
+            output(data, (*model.a[:i], model.a[i] + s * _STEP * sd[i], *model.a[i + 1 :]), model.delay_s, theta)
             for s in (1.0, -1.0)
         ]
         columns.append((ends[0] - ends[1]) / (2.0 * _STEP * sd[i]))
     gain = np.zeros_like(theta)
     gain[0] = 1.0
-    columns.append(_response(data, model.a, model.delay_s, gain))
+    columns.append(output(data, model.a, model.delay_s, gain))
     width = min(_STEP * sd[n + 1] + 1e-6 * model.delay_s, model.delay_s) or 1e-6
-    ahead = _response(data, model.a, model.delay_s + width, theta)
-    behind = _response(data, model.a, max(model.delay_s - width, 0.0), theta)
+    ahead = output(data, model.a, model.delay_s + width, theta)
+    behind = output(data, model.a, max(model.delay_s - width, 0.0), theta)
     columns.append((ahead - behind) / (model.delay_s + width - max(model.delay_s - width, 0.0)))
     moving = list(range(len(columns)))
     for k in np.flatnonzero(structure.linear)[1:]:
         unit = np.zeros_like(theta)
         unit[k] = 1.0
-        columns.append(_response(data, model.a, model.delay_s, unit))
+        columns.append(output(data, model.a, model.delay_s, unit))
     return np.column_stack(columns), moving
 
 

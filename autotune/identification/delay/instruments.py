@@ -118,15 +118,8 @@ def stabilise(a: FloatArray, duration_s: float) -> FloatArray:
     (n,) array
         Coefficients with the poles mirrored.
     """
-    n = a.size
-    if n <= 2 and np.all(a <= 0.0):
+    if a.size <= 2 and np.all(a <= 0.0):
         return a
-    polynomial = np.ones(n + 1, dtype=np.complex128)
-    polynomial[1:] = -a[::-1]
-    product = np.zeros(n + 1, dtype=np.complex128)  # descending powers of prod(s - root)
-    product[0] = 1.0
-    for root in np.roots(polynomial):
-        kept = -np.conj(root) if root.real > 1.0 / duration_s else root
-        for q in range(n, 0, -1):
-            product[q] -= kept * product[q - 1]
-    return -product.real[:0:-1]
+    poles = np.roots([1.0, *-a[::-1]])
+    mirrored = np.where(poles.real > 1.0 / duration_s, -np.conj(poles), poles)
+    return np.asarray(-np.real(np.poly(mirrored))[:0:-1], dtype=np.float64)

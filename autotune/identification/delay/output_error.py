@@ -97,10 +97,7 @@ def solve_linear(
     whitening : (p,) array
         Coefficients of the filter that makes the noise white.
     """
-    before = 0.0 if data.before is None else data.before
-    theta, cost = linear_part(
-        data.tu, data.u, before, data.linear, data.ty, data.y, a, h, structure.offset, structure.zeros, whitening
-    )
+    theta, cost = linear_part(data, a, h, structure.offset, structure.zeros, whitening)
     return Point(a=a, h=h, theta=theta, cost=cost, rows=data.ty.size - whitening.size)
 
 
@@ -147,7 +144,7 @@ def minimise(
     damping = 1e-3
     point = start
     for _ in range(iterations):
-        gram, finite = gram_at(data, point.a, point.h, point.theta, whitening)
+        gram, finite = normal_matrix(data, point.a, point.h, point.theta, True, whitening)
         if not finite:
             return point
         for _trial in range(8):
@@ -196,30 +193,4 @@ def residuals(data: DelayData, point: Point) -> FloatArray:
     (N,) array
         In y's unit; NaN from where the response overflows.
     """
-    before = 0.0 if data.before is None else data.before
-    return np.asarray(
-        data.y - output(data.tu, data.u, before, data.linear, data.ty, point.a, point.h, point.theta), dtype=np.float64
-    )
-
-
-def gram_at(
-    data: DelayData, a: tuple[float, ...], h: float, theta: FloatArray, whitening: FloatArray
-) -> tuple[FloatArray, bool]:
-    """Return the Gram matrix with sensitivities at a candidate, and whether it is finite.
-
-    Parameters
-    ----------
-    data : DelayData
-        The record.
-    a : tuple of n floats
-        Coefficients a_0..a_{n-1}.
-    h : float
-        Delay [s].
-    theta : (2+n+m,) array
-        b_0, d, the initial state, b_1..b_m.
-    whitening : (p,) array
-        Coefficients of the filter that makes the noise white.
-    """
-    before = 0.0 if data.before is None else data.before
-    gram, finite = normal_matrix(data.tu, data.u, before, data.linear, data.ty, data.y, a, h, theta, True, whitening)
-    return gram, finite
+    return np.asarray(data.y - output(data, point.a, point.h, point.theta), dtype=np.float64)

@@ -11,8 +11,8 @@ from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.model import DelayModel
-from autotune.identification.delay.output_error import Point, Structure, gram_at, minimise, residuals, solve_linear
-from autotune.identification.delay.response import sensitivities
+from autotune.identification.delay.output_error import Point, Structure, minimise, residuals, solve_linear
+from autotune.identification.delay.response import normal_matrix, sensitivities
 from autotune.identification.noise_colour import MAX_AR, WHITE, NoiseColour, noise_colour
 
 
@@ -100,7 +100,7 @@ def inverse_information(
         their covariance, but for the initial state's, which leaves out the free responses.
     """
     free = np.flatnonzero(structure.free)
-    gram, finite = gram_at(data, point.a, point.h, point.theta, whitening)
+    gram, finite = normal_matrix(data, point.a, point.h, point.theta, True, whitening)
     information = gram[np.ix_(free, free)]
     scale = np.sqrt(np.diag(information))
     if not finite or not np.all(scale > 0) or np.linalg.cond(information / np.outer(scale, scale)) > 1e13:
@@ -169,8 +169,7 @@ def colour_of(
     NoiseColour
         Its freedom is that of the free ones of (a, b, h, constant, initial state).
     """
-    before = 0.0 if data.before is None else data.before
-    columns = sensitivities(data.tu, data.u, before, data.linear, data.ty, point.a, point.h, point.theta)
+    columns = sensitivities(data, point.a, point.h, point.theta)
     to_free = _to_parameters(data, structure, point)[np.ix_(structure.free_parameters, structure.free)]
     in_parameters = np.linalg.solve(to_free.T, columns[:, structure.free].T).T
     rows = np.column_stack([in_parameters, residuals(data, point)])
@@ -248,7 +247,7 @@ def polish(
 
 def _singular(data: DelayData, structure: Structure, point: Point, whitening: FloatArray) -> IdentificationError:
     n, free = structure.order, np.flatnonzero(structure.free)
-    information = gram_at(data, point.a, point.h, point.theta, whitening)[0][np.ix_(free, free)]
+    information = normal_matrix(data, point.a, point.h, point.theta, True, whitening)[0][np.ix_(free, free)]
     names = ["b", "constant", *(f"x^({i})(t_s)" for i in range(n)), *(f"a{i}" for i in range(n)), "delay"]
     names = [name for name, free in zip(names, structure.free, strict=True) if free]
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from autotune.arrays import FloatArray
 from autotune.identification.delay.compiled import cholesky_solve, transitions
+from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.propagation import (
     BLOCK,
     begin,
@@ -34,12 +35,7 @@ from autotune.identification.delay.propagation import (
 
 
 def normal_matrix(
-    tu: FloatArray,
-    u: FloatArray,
-    before: float,
-    linear: bool,
-    ty: FloatArray,
-    y: FloatArray,
+    data: DelayData,
     a: tuple[float, ...],
     h: float,
     theta: FloatArray,
@@ -50,14 +46,8 @@ def normal_matrix(
 
     Parameters
     ----------
-    tu, u : (M,) array
-        Input and its time stamps [s].
-    before : float
-        Input before the record.
-    linear : bool
-        Whether the input runs linearly between its stamps (else it is held).
-    ty, y : (N,) array
-        Output and its time stamps [s]; the first stamp is t_s, where the initial state stands.
+    data : DelayData
+        N rows of y, at whose first stamp t_s the initial state stands; an input of unknown past is 0 there.
     a : tuple of n floats
         Coefficients a_0..a_{n-1}.
     h : float
@@ -85,33 +75,29 @@ def normal_matrix(
     order = whitening.size
     width = 2 * n + m + 4 if sensitive else 3 + n + m
     gram = np.zeros((width, width))
-    coefficients, chains, clock = begin(tu, ty, a, h, theta)
+    coefficients, chains, clock = begin(data.tu, data.ty, a, h, theta)
     rows = np.zeros((order + BLOCK, width))
     white = np.empty((BLOCK, width))
-    for first, outputs, pieces, F, which in _blocks(tu, u, before, linear, ty, h, coefficients, clock):
+    for first, outputs, pieces, F, which in _blocks(data, h, coefficients, clock):
         if not propagate(a, F, which, pieces, m, chains, rows[order:]):
             return gram, False
         if sensitive:
             propagate_sensitivities(a, theta, F, which, pieces, chains, rows[order:])
         skip = max(0, min(order - first, outputs))
-        _add_rows(gram, rows, white, y[first : first + outputs], skip, whitening, sensitive)
+        _add_rows(gram, rows, white, data.y[first : first + outputs], skip, whitening, sensitive)
     return gram, bool(np.all(np.isfinite(gram)))
 
 
 def _blocks(
-    tu: FloatArray,
-    u: FloatArray,
-    before: float,
-    linear: bool,
-    ty: FloatArray,
+    data: DelayData,
     h: float,
     coefficients: FloatArray,
     clock: FloatArray,
 ) -> Iterator[tuple[int, int, FloatArray, FloatArray, NDArray[np.int64]]]:
     """Yield each block's first output, how many it has, its pieces, their distinct transitions, and each piece's."""
-    first = 0
-    while first < ty.size:
-        pieces, outputs, durations, which = schedule(tu, u, before, linear, ty, h, clock)
+    first, before = 0, data.before or 0.0
+    while first < data.ty.size:
+        pieces, outputs, durations, which = schedule(data.tu, data.u, before, data.linear, data.ty, h, clock)
         yield first, outputs, pieces, transitions(coefficients, durations), which
         first += outputs
 
@@ -151,11 +137,7 @@ def _filter(rows: FloatArray, whitening: FloatArray, skip: int, count: int, whit
 
 
 def output(
-    tu: FloatArray,
-    u: FloatArray,
-    before: float,
-    linear: bool,
-    ty: FloatArray,
+    data: DelayData,
     a: tuple[float, ...],
     h: float,
     theta: FloatArray,
@@ -164,14 +146,8 @@ def output(
 
     Parameters
     ----------
-    tu, u : (M,) array
-        Input and its time stamps [s].
-    before : float
-        Input before the record.
-    linear : bool
-        Whether the input runs linearly between its stamps (else it is held).
-    ty : (N,) array
-        Output times [s].
+    data : DelayData
+        N rows of y, whose values do not count.
     a : tuple of n floats
         Coefficients a_0..a_{n-1}.
     h : float
@@ -180,10 +156,10 @@ def output(
         b_0, d, the initial state, b_1..b_m.
     """
     n = len(a)
-    x = np.full(ty.size, np.nan)
-    coefficients, chains, clock = begin(tu, ty, a, h, theta)
+    x = np.full(data.ty.size, np.nan)
+    coefficients, chains, clock = begin(data.tu, data.ty, a, h, theta)
     rows = np.zeros((BLOCK, theta.size))
-    for first, outputs, pieces, F, which in _blocks(tu, u, before, linear, ty, h, coefficients, clock):
+    for first, outputs, pieces, F, which in _blocks(data, h, coefficients, clock):
         if not propagate(a, F, which, pieces, theta.size - 2 - n, chains, rows):
             break
         x[first : first + outputs] = sum(rows[:outputs, c] * theta[c] for c in range(theta.size))
@@ -191,11 +167,7 @@ def output(
 
 
 def sensitivities(
-    tu: FloatArray,
-    u: FloatArray,
-    before: float,
-    linear: bool,
-    ty: FloatArray,
+    data: DelayData,
     a: tuple[float, ...],
     h: float,
     theta: FloatArray,
@@ -204,14 +176,8 @@ def sensitivities(
 
     Parameters
     ----------
-    tu, u : (M,) array
-        Input and its time stamps [s].
-    before : float
-        Input before the record.
-    linear : bool
-        Whether the input runs linearly between its stamps (else it is held).
-    ty : (N,) array
-        Output times [s].
+    data : DelayData
+        N rows of y, whose values do not count.
     a : tuple of n floats
         Coefficients a_0..a_{n-1}.
     h : float
@@ -220,9 +186,9 @@ def sensitivities(
         b_0, d, the initial state, b_1..b_m.
     """
     n, m = len(a), theta.size - 2 - len(a)
-    columns = np.zeros((ty.size, 2 * n + m + 4))
-    coefficients, chains, clock = begin(tu, ty, a, h, theta)
-    for first, _, pieces, F, which in _blocks(tu, u, before, linear, ty, h, coefficients, clock):
+    columns = np.zeros((data.ty.size, 2 * n + m + 4))
+    coefficients, chains, clock = begin(data.tu, data.ty, a, h, theta)
+    for first, _, pieces, F, which in _blocks(data, h, coefficients, clock):
         if not propagate(a, F, which, pieces, m, chains, columns[first:]):
             break
         propagate_sensitivities(a, theta, F, which, pieces, chains, columns[first:])
@@ -230,12 +196,7 @@ def sensitivities(
 
 
 def linear_part(
-    tu: FloatArray,
-    u: FloatArray,
-    before: float,
-    linear: bool,
-    ty: FloatArray,
-    y: FloatArray,
+    data: DelayData,
     a: tuple[float, ...],
     h: float,
     offset: bool,
@@ -246,14 +207,8 @@ def linear_part(
 
     Parameters
     ----------
-    tu, u : (M,) array
-        Input and its time stamps [s].
-    before : float
-        Input before the record.
-    linear : bool
-        Whether the input runs linearly between its stamps (else it is held).
-    ty, y : (N,) array
-        Output and its time stamps [s].
+    data : DelayData
+        N rows of y.
     a : tuple of n floats
         Coefficients a_0..a_{n-1}.
     h : float
@@ -271,7 +226,7 @@ def linear_part(
         The (2+n+m,) theta, and the sum of squares [y unit^2].
     """
     theta = np.zeros(2 + len(a) + zeros)
-    gram, finite = normal_matrix(tu, u, before, linear, ty, y, a, h, theta, False, whitening)
+    gram, finite = normal_matrix(data, a, h, theta, False, whitening)
     cost = _least_squares(gram, offset, theta) if finite else np.inf
     return theta, cost
 

@@ -11,7 +11,7 @@ from scipy.signal import lsim
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay import response
 from autotune.identification.delay.compiled import transitions
-from autotune.identification.delay.data import prepare
+from autotune.identification.delay.data import DelayData, prepare
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.output_error import Point, Structure, solve_linear
@@ -59,10 +59,10 @@ def test_transition_is_the_matrix_exponential():
 
 def test_response_equals_an_independent_solver():
     record = example_2(past_s=5.0)
-    y = output(
-        record.t, record.u, 0.0, True, record.t[record.t >= 0], A, 4.0, np.array([B, 0.0, *X0])
-    )  # what is left is u taken as linear between rows
-    assert np.max(np.abs(y - record.y[record.t >= 0])) < 1e-4
+    now = record.t >= 0
+    data = DelayData(tu=record.t, u=record.u, ty=record.t[now], y=record.y[now], linear=True, before=0.0)
+    y = output(data, A, 4.0, np.array([B, 0.0, *X0]))  # what is left is u taken as linear between rows
+    assert np.max(np.abs(y - data.y)) < 1e-4
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
@@ -76,9 +76,10 @@ def test_analytic_sensitivities_are_the_derivatives(n):
     values = np.array([*a, 1.3, 2.05, 0.2, *rng.standard_normal(n)])
 
     def x(p: np.ndarray) -> np.ndarray:
-        return output(t, u, 0.0, True, ty, tuple(p[:n]), p[n + 1], np.array([p[n], p[n + 2], *p[n + 3 :]]))
+        return output(data, tuple(p[:n]), p[n + 1], np.array([p[n], p[n + 2], *p[n + 3 :]]))
 
     ty = t[t > 2.2]
+    data = DelayData(tu=t, u=u, ty=ty, y=np.zeros(ty.size), linear=True, before=0.0)
     J = np.array([(x(values + d) - x(values - d)) / 2e-6 for d in 1e-6 * np.eye(values.size)]).T
     data = prepare(Recording(t=t, u=u, y=np.sin(t)), hold="linear", offset=True)
     data = replace(data, u=u, u_0=0.0, ty=ty, y=x(values), y_0=0.0)
@@ -103,14 +104,15 @@ def test_an_equation_with_zeros_answers_as_its_transfer_function_and_so_do_its_s
     theta = np.array([b[0], 0.0, *[0.0] * n, *b[1:]])
 
     def x(values: np.ndarray) -> np.ndarray:
-        return output(t, u, 0.0, False, t, tuple(values[:-1]), values[-1], theta)
+        return output(data, tuple(values[:-1]), values[-1], theta)
 
     values = np.array([*a, h])
+    data = DelayData(tu=t, u=u, ty=t, y=expected[::fine], linear=False, before=0.0)
     np.testing.assert_allclose(x(values), expected[::fine], atol=1e-9)
     J = np.array([(x(values + d) - x(values - d)) / 2e-6 for d in 1e-6 * np.eye(n + 1)]).T
-    columns = sensitivities(t, u, 0.0, False, t, a, h, theta)
+    columns = sensitivities(data, a, h, theta)
     np.testing.assert_allclose(columns[:, 2 + n + m :], J, atol=1e-6 * np.abs(J).max())
-    best, cost = linear_part(t, u, 0.0, False, t, x(values), a, h, True, m, np.empty(0))
+    best, cost = linear_part(replace(data, y=x(values)), a, h, True, m, np.empty(0))
     np.testing.assert_allclose(best, theta, atol=1e-6)
     assert cost < 1e-9
 
@@ -118,14 +120,14 @@ def test_an_equation_with_zeros_answers_as_its_transfer_function_and_so_do_its_s
 def test_a_higher_order_compiles_its_own_propagation_alone():
     """What does not unroll over the states is compiled once, for all orders: the first fit would take twice as long."""
     t = 0.1 * np.arange(50)
-    u, y = np.sin(t), np.cos(t)
+    data = DelayData(tu=t, u=np.sin(t), ty=t, y=np.cos(t), linear=False, before=0.0)
 
     def compiled(a: tuple[float, ...]) -> tuple[int, ...]:
         theta, white = np.zeros(2 + len(a)), np.empty(0)
-        normal_matrix(t, u, 0.0, False, t, y, a, 0.1, theta, True, white)
-        linear_part(t, u, 0.0, False, t, y, a, 0.1, True, 0, white)
-        sensitivities(t, u, 0.0, False, t, a, 0.1, theta)
-        output(t, u, 0.0, False, t, a, 0.1, theta)
+        normal_matrix(data, a, 0.1, theta, True, white)
+        linear_part(data, a, 0.1, True, 0, white)
+        sensitivities(data, a, 0.1, theta)
+        output(data, a, 0.1, theta)
         kernels = (response.schedule, response.transitions, response._add_rows, response._least_squares)
         return tuple(len(kernel.signatures) for kernel in kernels)
 
@@ -184,16 +186,10 @@ def test_jittered_stamps_cost_no_precision():
     record = example_2(rate_hz=50.0, past_s=6.0)
     rng = np.random.default_rng(4)
     t = record.t + rng.uniform(-0.008, 0.008, len(record))
-    x = output(
-        np.arange(-7.0, 105.1, 0.002),
-        example_2(rate_hz=500.0, past_s=7.0).u[: np.arange(-7.0, 105.1, 0.002).size],
-        0.0,
-        True,
-        t[t >= 0],
-        A,
-        4.0,
-        np.array([B, 0.0, *X0]),
-    )
+    tu, ty = np.arange(-7.0, 105.1, 0.002), t[t >= 0]
+    u = example_2(rate_hz=500.0, past_s=7.0).u[: tu.size]
+    data = DelayData(tu=tu, u=u, ty=ty, y=np.zeros(ty.size), linear=True, before=0.0)
+    x = output(data, A, 4.0, np.array([B, 0.0, *X0]))
     y = np.zeros(t.size)
     y[t >= 0] = x + 2.0 * rng.standard_normal(x.size)
     from tests.autotune.identification.delay_examples import u_example_2
@@ -300,9 +296,9 @@ def test_cost_is_the_sum_of_squares_and_the_gram_matrix_is_linear_in_rows():
     data = prepare(record, start_s=0.0, offset=False)
     structure = Structure(order=2, offset=False)
     point = solve_linear(data, structure, A, 4.0)
-    x = output(data.tu, data.u, 0.0, True, data.ty, A, 4.0, point.theta)
+    x = output(data, A, 4.0, point.theta)
     assert point.cost == pytest.approx(np.sum((data.y - x) ** 2), rel=1e-9)
-    args = (data.tu, data.u, 0.0, True, data.ty, data.y, A, 4.0, point.theta, True)
+    args = (data, A, 4.0, point.theta, True)
     gram, finite = normal_matrix(*args, np.empty(0))
     assert finite
     assert gram[-1, -1] == pytest.approx(point.cost, rel=1e-9)
