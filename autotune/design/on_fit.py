@@ -16,13 +16,12 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
 from autotune.design.members import Members, members_of
-from autotune.design.specification import Design, Kind, Specification
+from autotune.design.specification import PROBABILITY, Design, Kind, Specification
 from autotune.design.synthesis import design
 from autotune.errors import DesignError
 from autotune.identification.parametric import PlantFit
 from autotune.models import TransferFunction
 
-PROBABILITY = 0.95
 ROUNDS = 8
 #: probability below which the points contradict a fit's structure
 CONTRADICTED = 1e-3
@@ -30,9 +29,7 @@ CONTRADICTED = 1e-3
 TOLERANCE = 2e-3
 
 
-def design_on_fit(
-    fit: PlantFit, specification: Specification, kind: Kind = "pi", *, probability: float = PROBABILITY
-) -> Design:
+def design_on_fit(fit: PlantFit, specification: Specification, kind: Kind = "pi") -> Design:
     """Return the controller with the smallest norm on the estimate that keeps the constraints on the whole region.
 
     Parameters
@@ -43,8 +40,6 @@ def design_on_fit(
         Constraints (18).
     kind : {"pi", "pid"}
         Structure of the controller.
-    probability : float
-        Of the joint region of a structure's parameters.
 
     Returns
     -------
@@ -68,7 +63,7 @@ def design_on_fit(
             where="fitted plant",
             remedy="record the plant under steps of the command, which shows resonances, or design on a model of it",
         )
-    border = members_of(fit.border(probability), specification)
+    border = members_of(fit.border(PROBABILITY), specification)
     found, slack = design_on_plants(fit.plant, border, specification, kind)
     if np.min(slack) < -2.0 * TOLERANCE:
         raise DesignError(
@@ -78,7 +73,7 @@ def design_on_fit(
         )
     return replace(
         found,
-        certificate=f"margins hold on the border of the {100 * probability:g} % region of the fitted plant; no lower "
+        certificate=f"margins hold on the border of the {100 * PROBABILITY:g} % region of the fitted plant; no lower "
         "bound on the norm",
     )
 

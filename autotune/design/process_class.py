@@ -25,6 +25,7 @@ import numpy as np
 from scipy.optimize import linprog, nnls
 
 from autotune.arrays import BoolArray, FloatArray
+from autotune.design.specification import PROBABILITY
 from autotune.errors import DesignError
 from autotune.points import FrequencyPoint
 
@@ -164,19 +165,13 @@ def _program(A: FloatArray, b: FloatArray) -> highspy.Highs:
 _ROUNDING = 1e-14
 
 
-def consistent_processes(
-    points: Sequence[FrequencyPoint], *, probability: float = 0.95, inverse_response: bool = False
-) -> ConsistentProcesses:
+def consistent_processes(points: Sequence[FrequencyPoint]) -> ConsistentProcesses:
     """Return the class's members that pass through the joint region of the points.
 
     Parameters
     ----------
     points : sequence of FrequencyPoint
         At least three, the lowest with a phase above -180 degrees (of the plant with positive gain).
-    probability : float
-        Of the joint region: each point's own is probability^(1/N), so that all N hold together with it.
-    inverse_response : bool
-        Whether the class has all-pass factors and a zero in the right half plane besides dead time.
 
     Raises
     ------
@@ -190,9 +185,10 @@ def consistent_processes(
     sign, log_gain, phase = _log_polar(ordered)
     omega_0 = float(np.exp(np.mean(np.log(omega))))
     lags = _geometric(0.02 / omega[-1], 50.0 / omega[0])
-    inverse = _geometric(0.02 / omega[-1], 5.0 / omega[0]) if inverse_response else np.zeros(0)
+    inverse = _geometric(0.02 / omega[-1], 5.0 / omega[0])
     gain_rows, phase_rows = _rows(omega, lags, inverse, omega_0)
-    radius = math.sqrt(-2.0 * math.log(1.0 - probability ** (1.0 / len(ordered))))
+    # each point's own region is of probability^(1/N), so that all N hold together
+    radius = math.sqrt(-2.0 * math.log(1.0 - PROBABILITY ** (1.0 / len(ordered))))
     facets, centre, sd = [], [], []
     whitened_rows, whitened = [], []
     for i, point in enumerate(ordered):

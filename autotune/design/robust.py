@@ -25,7 +25,7 @@ from autotune.design.members import members_of
 from autotune.design.on_fit import ROUNDS, most_missed
 from autotune.design.on_structures import design_on_structures, require_kept
 from autotune.design.search import minimise
-from autotune.design.specification import UNCERTAIN, Design, Kind, Specification
+from autotune.design.specification import PROBABILITY, UNCERTAIN, Design, Kind, Specification
 from autotune.design.uncertain import UncertainPlant, guaranteed_figures, uncertain_plant
 from autotune.errors import DesignError
 from autotune.identification.consistent_structures import consistent_structures
@@ -41,14 +41,7 @@ _LOOKED, _LED, _INSIDE = 300, 3, 0.002
 _WALL = 1e4
 
 
-def design_on_points(
-    points: Sequence[FrequencyPoint],
-    specification: Specification,
-    kind: Kind = "pi",
-    *,
-    probability: float = 0.95,
-    inverse_response: bool = True,
-) -> Design:
+def design_on_points(points: Sequence[FrequencyPoint], specification: Specification, kind: Kind = "pi") -> Design:
     """Return the controller of the smallest nominal H2 norm whose margins hold for every plant that fits the points.
 
     Parameters
@@ -59,11 +52,6 @@ def design_on_points(
         Constraints (18).
     kind : {"pi", "pid"}
         Structure.
-    probability : float
-        Of the joint region of all points; it contains each point's own region of at least this probability.
-    inverse_response : bool
-        Whether all-pass factors, and a zero in the right half plane that makes the gain rise first, are among the
-        plants to be guarded against.
 
     Returns
     -------
@@ -78,14 +66,15 @@ def design_on_points(
 
     Notes
     -----
-    The guarantee is conditional on the class: aperiodic processes with dead time, at most one integrator. Sets at
-    different frequencies are treated as independent, which can only make it stricter.
+    The guarantee is conditional on the class: aperiodic processes with dead time, at most one integrator, all-pass
+    factors and a zero in the right half plane, which makes the gain rise first. Sets at different frequencies are
+    treated as independent, which can only make it stricter.
     """
     if len(points) < 3:
         raise DesignError(f"{len(points)} points", where="points", remedy="a design on points needs at least three")
     of_low_order = consistent_structures(points)
     try:
-        plant = uncertain_plant(points, probability=probability, inverse_response=inverse_response)
+        plant = uncertain_plant(points)
     except DesignError:
         if not of_low_order.plants:
             raise
@@ -94,7 +83,7 @@ def design_on_points(
     chosen: list[int] = []
     for _ in range(ROUNDS):
         held = replace(plant, members=members.chosen(chosen).sampled)
-        found = _answer(held, specification, kind, _search(held, specification, kind), probability)
+        found = _answer(held, specification, kind, _search(held, specification, kind))
         if not members.plants:
             return found
         slack = members.slacks(found.controller, specification)
@@ -318,9 +307,7 @@ def _coarse_grid(plant: UncertainPlant, specification: Specification, kind: Kind
     )
 
 
-def _answer(
-    plant: UncertainPlant, specification: Specification, kind: Kind, p: FloatArray, probability: float
-) -> Design:
+def _answer(plant: UncertainPlant, specification: Specification, kind: Kind, p: FloatArray) -> Design:
     from autotune.design.synthesis import weight_set_point
 
     n = plant.nominal
@@ -348,7 +335,6 @@ def _answer(
         f"; {UNCERTAIN} the regions had to be taken {grown:.2f} times as large before any such process passed through"
     )
     remark = f"{remark} them" if grown > 1.0 else ""
-    inverse = ", with or without inverse response," if plant.processes.inverse_s.size else ""
     return Design(
         kind=kind,
         controller=weight_set_point(controller, specification),
@@ -358,9 +344,9 @@ def _answer(
         binding=specification.binding(m.figures),
         margins=m,
         certificate=(
-            f"margins hold for every aperiodic process with dead time{inverse} through the joint "
-            f"{100 * probability:g} % region of the {len(plant.processes.omega_points)} points; no lower bound on the "
-            f"norm{remark}"
+            "margins hold for every aperiodic process with dead time, with or without inverse response, through "
+            f"the joint {100 * PROBABILITY:g} % region of the {len(plant.processes.omega_points)} points; no lower bound "
+            f"on the norm{remark}"
         ),
     )
 

@@ -20,8 +20,8 @@ Kind: TypeAlias = Literal["pi", "pid"]
 _EQUAL = {"h2": 1e-4, "iae": 3e-3}
 #: what a certificate says of margins that need not hold on every plant that the measurements allow
 UNCERTAIN = "not certain:"
-
-
+#: of the joint region of points, or of a fit's parameters, on which margins are kept
+PROBABILITY = 0.95
 #: a margin as small as this asks for nothing, and its reciprocal is no gain
 _LEAST = 1e-9
 

@@ -56,32 +56,25 @@ class UncertainPlant:
         )
 
 
-def uncertain_plant(
-    points: Sequence[FrequencyPoint], *, probability: float = 0.95, inverse_response: bool = True
-) -> UncertainPlant:
+def uncertain_plant(points: Sequence[FrequencyPoint]) -> UncertainPlant:
     """Return what the points say about the plant, between and beyond them.
 
     Parameters
     ----------
     points : sequence of FrequencyPoint
         At least three, with covariance.
-    probability : float
-        Of the joint region of all points.
-    inverse_response : bool
-        Whether the class has all-pass factors and a zero in the right half plane besides lags, one integrator and
-        dead time.
 
     Raises
     ------
     DesignError
         See :func:`autotune.design.process_class.consistent_processes`.
     """
-    return _uncertain_plant(tuple(points), probability, inverse_response)
+    return _uncertain_plant(tuple(points))
 
 
 @lru_cache(maxsize=4)  # PI and PID, or two specifications, are often designed on the same points
-def _uncertain_plant(points: tuple[FrequencyPoint, ...], probability: float, inverse_response: bool) -> UncertainPlant:
-    processes = consistent_processes(points, probability=probability, inverse_response=inverse_response)
+def _uncertain_plant(points: tuple[FrequencyPoint, ...]) -> UncertainPlant:
+    processes = consistent_processes(points)
     first, last = processes.omega_points[0], processes.omega_points[-1]
     inner = np.geomspace(0.7 * first, 1.5 * last, int(math.log(1.5 * last / (0.7 * first)) / 0.12) + 2)
     below = np.geomspace(first / _BELOW, 0.7 * first, 7)[:-1]

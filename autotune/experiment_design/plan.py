@@ -270,7 +270,7 @@ def _least_chi2(result: Fit, data: Data) -> float:
         return 0.0  # nothing is known of what it would predict
 
 
-def general(sim: Simulator, conditions: Conditions, duration_s: float, seed: int = 0) -> Excitation:
+def general(sim: Simulator, conditions: Conditions, duration_s: float) -> Excitation:
     """Return the experiment to begin with while there is no hypothesis: random steps over many levels and dwells.
 
     Parameters
@@ -281,15 +281,13 @@ def general(sim: Simulator, conditions: Conditions, duration_s: float, seed: int
         Present law, sample time and limits.
     duration_s : float
         Length of the experiment [s].
-    seed : int
-        Of its levels and dwells.
 
     Raises
     ------
     InputError
         Nothing fits into the limits.
     """
-    choices: Sequence[Excitation] = excitations(sim, conditions, duration_s, seed)
+    choices: Sequence[Excitation] = excitations(sim, conditions, duration_s)
     steps = [one for one in choices if one.kind == "random steps"]
     if not steps:
         raise InputError(

@@ -39,6 +39,8 @@ from autotune.identification.structure_evidence import (
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
 
+#: of the joint region of all points that a plant passes through
+_PROBABILITY = 0.99
 #: structures with so many more parameters than the smallest that fits are members too
 _MORE = 2
 _WALKERS, _STEPS, _KEPT = 48, 400, 64
@@ -175,22 +177,20 @@ class ConsistentStructures:
     omega_points: tuple[float, ...]
 
 
-def consistent_structures(points: Sequence[FrequencyPoint], *, probability: float = 0.99) -> ConsistentStructures:
+def consistent_structures(points: Sequence[FrequencyPoint]) -> ConsistentStructures:
     """Return plants of low order that pass through the joint region of the points.
 
     Parameters
     ----------
     points : sequence of FrequencyPoint
         At least three, with covariance.
-    probability : float
-        Of the joint region of all points.
     """
-    return _consistent(tuple(points), probability)
+    return _consistent(tuple(points))
 
 
 @lru_cache(maxsize=4)
-def _consistent(points: tuple[FrequencyPoint, ...], probability: float) -> ConsistentStructures:
-    evidence = evidence_of(points, probability)
+def _consistent(points: tuple[FrequencyPoint, ...]) -> ConsistentStructures:
+    evidence = evidence_of(points, _PROBABILITY)
     rng = np.random.default_rng(0)
     plants: list[TransferFunction] = []
     structures: list[Structure] = []

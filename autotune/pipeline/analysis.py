@@ -15,12 +15,12 @@ from autotune.design.checks import Check, checks, on_plants
 from autotune.design.margins import Margins, margins
 from autotune.design.noise import LoopFacts, default_noise_gain
 from autotune.design.nugap import Validation, loop_scaling, validate
-from autotune.design.on_fit import CONTRADICTED, PROBABILITY, design_on_fit, worst_of
+from autotune.design.on_fit import CONTRADICTED, design_on_fit, worst_of
 from autotune.design.on_reduced import design_on_reduced
 from autotune.design.plausibility import implausible
 from autotune.design.process_class import consistent_processes
 from autotune.design.robust import design_on_points
-from autotune.design.specification import UNCERTAIN, Design, Kind, Specification
+from autotune.design.specification import PROBABILITY, UNCERTAIN, Design, Kind, Specification
 from autotune.design.synthesis import design as synthesised
 from autotune.errors import AutotuneError, DesignError
 from autotune.identification.consistent_structures import consistent_structures
@@ -367,7 +367,7 @@ def _on_structures(
     """
     plants = consistent_structures(points).plants
     if not plants:
-        consistent_processes(points, inverse_response=True)
+        consistent_processes(points)
         return ()
     worst = worst_of(plants, controller, asked)
     return (on_plants(worst, controller, asked, "the plants of low order through the points"),)

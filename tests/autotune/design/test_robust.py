@@ -45,7 +45,7 @@ def test_the_true_plant_lies_in_the_set_between_and_beyond_its_exact_points(
 ) -> None:
     plant = _lags(constants, delay_s, integrator)
     points = measured(plant, None)
-    processes = consistent_processes(points, inverse_response=True)
+    processes = consistent_processes(points)
     omega = np.geomspace(0.3 * points[0].omega_rad_s, 3.0 * points[-1].omega_rad_s, 12)
     response = plant.response(omega)
     # unwrapped from far below, where the phase of a plant of this class is known
@@ -58,7 +58,7 @@ def test_the_true_plant_lies_in_the_set_between_and_beyond_its_exact_points(
 
 def test_points_of_the_reduced_model_are_in_the_class_with_inverse_response() -> None:
     points = measured(REDUCED, None, gain_sd=1e-3, phase_sd_deg=0.05)
-    assert consistent_processes(points, inverse_response=True).inflation == 1.0
+    assert consistent_processes(points).inflation == 1.0
 
 
 @pytest.mark.parametrize("seed", range(4))
