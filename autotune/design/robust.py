@@ -345,8 +345,8 @@ def _answer(plant: UncertainPlant, specification: Specification, kind: Kind, p: 
         margins=m,
         certificate=(
             "margins hold for every aperiodic process with dead time, with or without inverse response, through "
-            f"the joint {100 * PROBABILITY:g} % region of the {len(plant.processes.omega_points)} points; no lower bound "
-            f"on the norm{remark}"
+            f"the joint {100 * PROBABILITY:g} % region of the {len(plant.processes.omega_points)} points; no lower "
+            f"bound on the norm{remark}"
         ),
     )
 
