@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from autotune.config.procedure import SignalSettings
 from autotune.controller import PIDController
-from autotune.diagnosis.result import Diagnosis
 from autotune.experiment.judgement import Verification
 from autotune.experiment.leaving import sentence
 from autotune.pipeline import Tuning
@@ -21,6 +20,9 @@ from autotune.report.figures import ratio_title, recording_figure
 from autotune.report.outlook import outlook_section, outlook_sentences
 from autotune.report.page import Figure, Page, Section, Table
 from autotune.report.verification_section import verification_section
+
+if TYPE_CHECKING:  # the diagnosis takes long to import, and few runs ask for one
+    from autotune.diagnosis.result import Diagnosis
 
 
 def run_page(
