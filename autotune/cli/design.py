@@ -17,8 +17,10 @@ from autotune.outputs import Output
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from autotune.design.specification import Design, Specification
+    from autotune.design.specification import Design, Kind, Specification
     from autotune.models import TransferFunction
+
+    Asked = Callable[..., Specification]  # from the plant, and the highest frequency that is known of it
 
 
 @app.command("design")
@@ -83,21 +85,7 @@ def design_command(
         )
 
     if model is not None:
-        from autotune.design.loop import transfer_function_of
-        from autotune.design.synthesis import design
-        from autotune.identification.reduced_file import read_reduced
-        from autotune.model_file import read_model
-        from autotune.pipeline.analysis import on_reduced_model
-
-        H = transfer_function_of(read_model(model))
-        wanted = asked(H)
-        reduced = read_reduced(model)
-        if reduced is None:
-            designed = design(H, wanted, kind, certificate=certificate)
-        else:
-            designed, looked = on_reduced_model(reduced, wanted, kind, certificate=certificate)
-            seen = "; ".join(check.sentence for check in looked) or designed.certificate
-            typer.echo(f"designed on the reduced model; checked: {seen}")
+        designed = _on_model(model, asked, kind, certificate=certificate)
     else:
         assert points is not None
         designed = _on_points(points, asked, kind)
@@ -108,7 +96,25 @@ def design_command(
     typer.echo(f"wrote {out}" + (f" and {controller}" if controller is not None else ""))
 
 
-def _on_points(points: Path, asked: Callable[..., Specification], kind: Literal["pi", "pid"]) -> Design:
+def _on_model(model: Path, asked: Asked, kind: Kind, *, certificate: bool) -> Design:
+    """Return the design on a model file, and say what it was checked on where the model is a reduced one."""
+    from autotune.design.loop import transfer_function_of
+    from autotune.design.synthesis import design
+    from autotune.identification.reduced_file import read_reduced
+    from autotune.model_file import read_model
+    from autotune.pipeline.analysis import on_reduced_model
+
+    H = transfer_function_of(read_model(model))
+    wanted, reduced = asked(H), read_reduced(model)
+    if reduced is None:
+        return design(H, wanted, kind, certificate=certificate)
+    designed, looked = on_reduced_model(reduced, wanted, kind, certificate=certificate)
+    seen = "; ".join(check.sentence for check in looked) or designed.certificate
+    typer.echo(f"designed on the reduced model; checked: {seen}")
+    return designed
+
+
+def _on_points(points: Path, asked: Asked, kind: Kind) -> Design:
     """Return the design on a file of points, or on the joint region of an identified loop's file, and say on what."""
     from autotune.design.on_fit import design_on_fit
     from autotune.design.specification import UNCERTAIN

@@ -161,7 +161,7 @@ def init(
     if simulated and isinstance(twin, str):
         content = _simulated_config(twin)
     else:
-        given = {"host": host, "device": device, "recording": recording, "y_span": y_span, "u_span": u_span}
+        given: Table = {"host": host, "device": device, "recording": recording, "y_span": y_span, "u_span": u_span}
         given |= {"endpoint": endpoint, "y_node": y_node, "u_node": u_node, "y_place": y_place, "u_place": u_place}
         reached = _ask_rig(questions, chosen, given | {"y": y_register, "u": u_register})
         if registers and not chosen.has_registers:
@@ -172,20 +172,14 @@ def init(
             twin = questions.ask("--model", twin, asked, _plant_or_model, "") or None
         if isinstance(twin, ModelOfRig):
             twin.place(config)  # refused before more is asked in vain
-        answers = {
-            "u_unit": questions.ask("--u-unit", u_unit, "unit of the command u", str, ""),
-            "y_unit": questions.ask("--y-unit", y_unit, "unit of the measurement y", str, ""),
-            "sample_time_s": questions.ask("--sample-time", sample_time, "control period [s], e.g. 0.1", number),
-            "u_range": questions.ask("--u-range", u_range, f"{_RANGE.format('command u')}, e.g. 0 100", limits),
+        told: Table = {
+            "u_unit": u_unit,
+            "y_unit": y_unit,
+            "sample_time_s": sample_time,
+            "u_range": u_range,
+            "u_safe": u_safe,
         }
-        of_u = number_within(answers["u_range"])
-        answers["u_safe"] = questions.ask("--u-safe", u_safe, "command at which the rig may be left alone", of_u)
-        answers["y_range"] = questions.ask("--y-range", y_range, _RANGE.format("measurement y"), limits)
-        centre = middle(answers["y_range"])  # y is chosen; what command holds it there is known to the person alone
-        answers["y"] = questions.ask(
-            "--y", y, "y of the operating point", number_within(answers["y_range"]), suggested=centre
-        )
-        answers["u"] = questions.ask("--u", u, "command that holds it there, about", of_u)
+        answers = _ask_signals(questions, told | {"y_range": y_range, "y": y, "u": u})
         questions.require()
         played = _settings_of_twin(twin, config, answers)
         content = _real(reached | (played if simulated else {"twin": played} if played else {}), answers)
@@ -201,6 +195,24 @@ def init(
         console.print(f"next: autotune run {config} --out runs/{config.stem}", markup=False)
     else:
         console.print(f"next: read it through, then autotune doctor {config}, autotune probe {config}", markup=False)
+
+
+def _ask_signals(questions: Questions, given: Mapping[str, Any]) -> Table:
+    """Return units, control period, ranges and the operating point; what no flag says is asked."""
+    answers: Table = {
+        "u_unit": questions.ask("--u-unit", given["u_unit"], "unit of the command u", str, ""),
+        "y_unit": questions.ask("--y-unit", given["y_unit"], "unit of the measurement y", str, ""),
+        "sample_time_s": questions.ask("--sample-time", given["sample_time_s"], "control period [s], e.g. 0.1", number),
+        "u_range": questions.ask("--u-range", given["u_range"], f"{_RANGE.format('command u')}, e.g. 0 100", limits),
+    }
+    of_u = number_within(answers["u_range"])
+    answers["u_safe"] = questions.ask("--u-safe", given["u_safe"], "command at which the rig may be left alone", of_u)
+    answers["y_range"] = questions.ask("--y-range", given["y_range"], _RANGE.format("measurement y"), limits)
+    of_y, centre = number_within(answers["y_range"]), middle(answers["y_range"])
+    # y is chosen, its middle suggested; what command holds it there is known to the person alone
+    answers["y"] = questions.ask("--y", given["y"], "y of the operating point", of_y, suggested=centre)
+    answers["u"] = questions.ask("--u", given["u"], "command that holds it there, about", of_u)
+    return answers
 
 
 def _plant_or_model(answer: str) -> str | ModelOfRig:

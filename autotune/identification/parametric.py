@@ -216,47 +216,17 @@ def _fit_structure(
     omega: FloatArray, measured: ComplexArray, whitener: FloatArray, integrating: bool, lags: int
 ) -> PlantFit:
     """Weighted least squares from several starts, with the exact derivatives of the response."""
-    middle = float(np.exp(np.mean(np.log(omega))))
-
-    def whiten(values: ComplexArray) -> FloatArray:
-        parts = np.stack([values.real, values.imag], axis=-1)
-        return np.asarray(np.einsum("nij,...nj->...ni", whitener, parts)).reshape(*values.shape[:-1], -1)
-
-    def jacobian(parameters: FloatArray, sign: int) -> FloatArray:
-        s = 1j * omega
-        tau = np.exp(parameters[1:-1])[:, np.newaxis]
-        derivatives = np.vstack([np.ones((1, omega.size)), -s * tau / (1 + s * tau), -s[np.newaxis]])
-        return whiten(derivatives * _response(omega, parameters, sign, integrating)).T
-
-    def fit(sign: int, ratios: Sequence[float]) -> OptimizeResult:
-        start = np.array([0.0, *(math.log(ratio / middle) for ratio in ratios), 0.1 / middle])
-        start[0] = float(np.mean(np.log(np.abs(measured / _response(omega, start, sign, integrating)))))
-
-        def residuals(x: FloatArray) -> FloatArray:
-            return whiten(_response(omega, x, sign, integrating) - measured)
-
-        def derivatives(x: FloatArray) -> FloatArray:
-            return jacobian(x, sign)
-
-        return least_squares(
-            residuals,
-            np.clip(start, lower + 1e-9, upper - 1e-9),
-            jac=derivatives,
-            bounds=(lower, upper),
-            x_scale="jac",
-            max_nfev=60,
-        )
-
     lower = np.array([-np.inf, *[math.log(1e-3 / omega[-1])] * lags, 0.0])
     upper = np.array([np.inf, *[math.log(1e3 / omega[0])] * lags, 2 * np.pi / omega[0]])
     starts = [(sign, ratios) for sign in (1, -1) for ratios in combinations_with_replacement((0.3, 3.0), lags)]
-    sign, found = min(((sign, fit(sign, ratios)) for sign, ratios in starts), key=lambda pair: float(pair[1].cost))
+    fits = ((s, _fit_from(r, s, omega, measured, whitener, integrating, (lower, upper))) for s, r in starts)
+    sign, found = min(fits, key=lambda pair: float(pair[1].cost))
     chi_square, freedom = 2 * float(found.cost), 2 * omega.size - found.x.size
     excess = max(1.0, chi_square / freedom) if freedom > 0 else 1.0
 
     def rise(step: FloatArray) -> float:
         with np.errstate(over="ignore", invalid="ignore"):
-            error = whiten(_response(omega, found.x + step, sign, integrating) - measured)
+            error = _whiten(_response(omega, found.x + step, sign, integrating) - measured, whitener)
             return float(error @ error) - chi_square
 
     covariance = excess * _as_far_as_it_rises(inverse_in_any_units(found.jac.T @ found.jac), rise)
@@ -277,6 +247,38 @@ def _fit_structure(
         criterion=chi_square + found.x.size * math.log(2 * omega.size),
         largest_residual=float(np.max(np.abs(_response(omega, found.x, sign, integrating) / measured - 1.0))),
     )
+
+
+def _fit_from(
+    ratios: Sequence[float],
+    sign: int,
+    omega: FloatArray,
+    measured: ComplexArray,
+    whitener: FloatArray,
+    integrating: bool,
+    bounds: tuple[FloatArray, FloatArray],
+) -> OptimizeResult:
+    """Fit one structure from lags that are these ratios of the middle period."""
+    middle = float(np.exp(np.mean(np.log(omega))))
+    start = np.array([0.0, *(math.log(ratio / middle) for ratio in ratios), 0.1 / middle])
+    start[0] = float(np.mean(np.log(np.abs(measured / _response(omega, start, sign, integrating)))))
+    s = 1j * omega
+
+    def residuals(x: FloatArray) -> FloatArray:
+        return _whiten(_response(omega, x, sign, integrating) - measured, whitener)
+
+    def jacobian(x: FloatArray) -> FloatArray:
+        tau = np.exp(x[1:-1])[:, np.newaxis]
+        derivatives = np.vstack([np.ones((1, omega.size)), -s * tau / (1 + s * tau), -s[np.newaxis]])
+        return _whiten(derivatives * _response(omega, x, sign, integrating), whitener).T
+
+    start = np.clip(start, bounds[0] + 1e-9, bounds[1] - 1e-9)
+    return least_squares(residuals, start, jac=jacobian, bounds=bounds, x_scale="jac", max_nfev=60)
+
+
+def _whiten(values: ComplexArray, whitener: FloatArray) -> FloatArray:
+    parts = np.stack([values.real, values.imag], axis=-1)
+    return np.asarray(np.einsum("nij,...nj->...ni", whitener, parts)).reshape(*values.shape[:-1], -1)
 
 
 def _as_far_as_it_rises(covariance: FloatArray, rise: Callable[[FloatArray], float]) -> FloatArray:

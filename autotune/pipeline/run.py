@@ -180,18 +180,23 @@ def _tune(
         with contextlib.suppress(OSError):  # a full disk must not hide why the run ended
             write_result(out / RESULT, experiment, analysis, None, reason=str(error))
         raise
+    tuning = Tuning(
+        experiment=experiment, analysis=analysis, verification=verification, old_controller=old, deployed=deployed
+    )
+    _write_completed(tuning, out)
+    return tuning
+
+
+def _write_completed(tuning: Tuning, out: Path) -> None:
     try:
-        write_result(out / RESULT, experiment, analysis, verification, reason="completed")
+        write_result(out / RESULT, tuning.experiment, tuning.analysis, tuning.verification, reason="completed")
     except OSError as error:
-        refused, gains = unwritable(error, out / RESULT), "new" if deployed else "old"
+        refused, gains = unwritable(error, out / RESULT), "new" if tuning.deployed else "old"
         raise ExperimentStopped(
             f"{refused.what}; the run is complete and the rig's controller holds the {gains} gains",
             where=refused.where,
             remedy=f"free space, then autotune run --resume {out}",
         ) from None
-    return Tuning(
-        experiment=experiment, analysis=analysis, verification=verification, old_controller=old, deployed=deployed
-    )
 
 
 @dataclass(frozen=True, kw_only=True)
