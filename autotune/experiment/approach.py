@@ -15,6 +15,7 @@ from autotune.experiment.limits import Watch
 from autotune.experiment.local_model import lag_beyond_integrator
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import Oscillation, mean_command, noise_half, too_noisy
+from autotune.experiment.plant_sign import find_sign
 from autotune.experiment.preflight import SMALL, Known, Tell
 from autotune.experiment.relay import RelaySettings
 from autotune.identification.envelope import polar_sd
@@ -62,7 +63,7 @@ def approach(
     u_guess = u_rest if u_rest is not None else point.u_guess
     known = replace(known, midpoint=u_guess, y_moved=point.y)
     known = replace(known, first_move_s=loop.tick.t_s)
-    return known if known.plant_sign != 0 else _find_sign(loop, point, known, tell)
+    return known if known.plant_sign != 0 else find_sign(loop, point, known, tell)
 
 
 def _ramp(
@@ -121,33 +122,6 @@ def _sign_of(moved: float, climbed: float, loop: ControlLoop, known: Known) -> i
             remedy="correct plant_sign, or check the wiring of actuator and sensor",
         )
     return sign
-
-
-def _find_sign(loop: ControlLoop, point: OperatingPointSettings, known: Known, tell: Tell) -> Known:
-    """Push the command up, then down, and compare how y moves."""
-    tell("finding the sign of the plant's gain")
-    push = 0.5 * point.u_uncertainty
-    distance = 4.0 * known.noise_half + 0.1 * loop.envelope.settings.swing
-    patience = 0.1 * loop.envelope.settings.time_s
-    slopes = []
-    for direction in (1.0, -1.0):
-        start = loop.tick
-        y0 = median(loop.monitor.recent)
-        while abs(median(loop.monitor.recent) - y0) < distance:
-            if loop.tick.t_s - start.t_s > patience:
-                break
-            loop.step(loop.nearest(known.midpoint + direction * push))
-        slopes.append((median(loop.monitor.recent) - y0) / max(loop.tick.t_s - start.t_s, SMALL))
-    if abs(slopes[0] - slopes[1]) * patience < distance:
-        raise ExperimentStopped(
-            f"the plant does not answer: y stays within {distance:.3g} for commands {push:.3g} above and below u_guess",
-            where="approach",
-            remedy="look for a stuck actuator; else raise operating_point.u_uncertainty",
-        )
-    # the command between the two at which y would have stood still
-    balance = -(slopes[0] + slopes[1]) / (slopes[0] - slopes[1])
-    midpoint = known.midpoint + push * min(max(balance, -2.0), 2.0)
-    return replace(known, plant_sign=1 if slopes[0] > slopes[1] else -1, sign_seen=True, midpoint=midpoint)
 
 
 def find_midpoint(
