@@ -149,6 +149,8 @@ def _once_more(run: SweepRun, targets: Sequence[float]) -> None:
     run.note_look(found, targets)
     if not found.why:
         run.take_together()
+    else:
+        run.tell(f"each point by itself: {found.why}", 0.0)
 
 
 def _further(run: SweepRun, choices: Sequence[Choice], share: float, left_s: float) -> tuple[int, ...]:
