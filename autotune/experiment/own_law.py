@@ -101,7 +101,7 @@ class _Rows:
         self.asked = (0.0, 0.0)
         self.held: list[tuple[float, float]] = []
         self.r, self.load = operating_y, 0.0
-        self._test, self._operating_y = test, operating_y
+        self._test = test
         self._range = (limits.u_min, limits.u_max)
         self._sample_time_s = loop.sample_time_s
         self._rows: list[tuple[float, float, float, float]] = []

@@ -128,7 +128,7 @@ def find_roles(table: Table, given: SignalNames) -> Roles:
     else:
         u, y = named.get("u", ""), named.get("y", "")
         unsure += [role for role, name in (("u", u), ("y", y)) if not name]
-    r = r or _same_loop(table, points["r"], u, y)
+    r = r or _same_loop(points["r"], u, y)
     names = SignalNames(t=time[0] if time else "", u=u, y=y, r=r)
     taken = {*time, u, y, r}
     return Roles(time=time, names=names, unsure=tuple(unsure), others=tuple(n for n in numeric if n not in taken))
@@ -278,7 +278,7 @@ def _stem(name: str) -> str:
     return parts[0] if len(parts) == 2 else ""
 
 
-def _same_loop(table: Table, points: Mapping[str, float], u: str, y: str) -> str:
+def _same_loop(points: Mapping[str, float], u: str, y: str) -> str:
     """Return the set-point among several that has the stem of the loop's other tags."""
     stems = {_stem(u), _stem(y)} - {""}
     found = [name for name, value in points.items() if value >= 2 and _stem(name) in stems and name not in (u, y)]

@@ -127,7 +127,7 @@ def limit_cycle_points(
     slack = 1e-6 * window.period_s  # a stamp and a switch at one instant differ by rounding
     inside = (t >= window.start_s - slack) & (t < window.end_s - slack)
     good = inside & np.isfinite(y)
-    orders = _orders(window, t, good, highest_harmonic)
+    orders = _orders(window, good, highest_harmonic)
     fit, reference, outliers = _corrected_fit(t, u, y, good, window, orders, known)
     omega = window.omega_rad_s * np.array(orders)
     U = held_coefficients(t, u, omega, window.start_s, window.end_s)
@@ -138,7 +138,7 @@ def limit_cycle_points(
     return _summary(t, u, y, good, window, edges, points, fit, outliers + int((inside & ~good).sum()))
 
 
-def _orders(window: WholePeriods, t: FloatArray, good: BoolArray, highest: int) -> tuple[int, ...]:
+def _orders(window: WholePeriods, good: BoolArray, highest: int) -> tuple[int, ...]:
     """Return the harmonics to fit: all orders (an asymmetric cycle has even ones) well below the Nyquist frequency."""
     per_period = int(good.sum()) / window.periods
     if per_period < 8:
