@@ -181,6 +181,12 @@ def _rest(x: NDArray[np.float64], u: float, t: float) -> None:
 
 
 @njit(cache=True)
+def _copy(new: NDArray[np.float64], x: NDArray[np.float64]) -> None:
+    for i in range(4):  # entry by entry: an assigned slice is compiled with the text of its error, for seconds
+        x[i] = new[i]
+
+
+@njit(cache=True)
 def _advance(x: NDArray[np.float64], u: float, dt_s: float, ends: bool) -> None:
     """Advance the state in place through flights, landings and lift-offs."""
     left = dt_s
@@ -196,7 +202,7 @@ def _advance(x: NDArray[np.float64], u: float, dt_s: float, ends: bool) -> None:
                 x[0] = 0.0
                 step = min(left, LOOK_S)
                 _fly(x, u, step, new)
-                x[:] = new
+                _copy(new, x)
                 x[2] = min(max(x[2], CEILING), FLOOR)  # rounding only
                 left -= step
             continue
@@ -215,5 +221,5 @@ def _advance(x: NDArray[np.float64], u: float, dt_s: float, ends: bool) -> None:
             _fly(x, u, late, new)
             new[1], new[2] = 0.0, end
             step = late
-        x[:] = new
+        _copy(new, x)
         left -= step

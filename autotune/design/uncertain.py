@@ -186,8 +186,10 @@ def guaranteed_figures(
     for i in range(len(omega)):
         w = omega[i]
         C = complex(K, K * (Td * w - 1.0 / (Ti * w))) / complex(1.0, Tf * w)
-        h_before[:] = h
-        h[:] = supports[i] + a * math.log(abs(C)) + b * math.atan2(C.imag, C.real)
+        h, h_before = h_before, h
+        gain_C, phase_C = math.log(abs(C)), math.atan2(C.imag, C.real)
+        for d in range(directions):  # entry by entry: an assigned slice is compiled with the text of its error
+            h[d] = supports[i, d] + a[d] * gain_C + b[d] * phase_C
         near_unit = max(h[0], h_before[0]) >= 0.0 and max(h[directions // 2], h_before[directions // 2]) >= 0.0
         if i > 0 and near_unit:
             angle = _lowest_phase_at_unit_gain(a, b, h_before, h) + math.pi

@@ -398,10 +398,13 @@ def advance(
                     high = middle
                 else:
                     low = middle
-            s[:] = _rk4(t, high, s, ramp, direction, mode, p, work)
+            after = _rk4(t, high, s, ramp, direction, mode, p, work)
+            for i in range(s.size):
+                s[i] = after[i]
             t += high
             direction, mode = settle(t, s, direction, mode, p)
             continue
-        s[:] = after
+        for i in range(s.size):  # entry by entry: an assigned slice is compiled with the text of its error, for seconds
+            s[i] = after[i]
         t += step
     return direction, mode

@@ -113,7 +113,7 @@ def _free_runs(A: Floats, b0: Floats, b1: Floats, u: Floats, rows: int, begin: i
                 z[a] = b0[a] * before + b1[a] * after
                 for b in range(a + 1):
                     z[a] += A[a, b] * x[b]
-            x[:] = z
+            x, z = z, x
     return out
 
 
@@ -129,12 +129,12 @@ def _powers(A: Floats, c: Floats, length: int) -> Floats:
     out = np.empty((length, n))
     row, after = c.copy(), np.empty(n)
     for k in range(length):
-        out[k] = row
         for j in range(n):
+            out[k, j] = row[j]
             after[j] = 0.0
             for i in range(n):
                 after[j] += row[i] * A[i, j]
-        row[:] = after
+        row, after = after, row
     return out
 
 

@@ -140,7 +140,7 @@ def _runs(
                 for b in range(n):
                     z[a] += A[a, b] * x[b]
             out[w, i] = y
-            x[:] = z
+            x, z = z, x
 
 
 def free_runs(steps: Steps, u: Floats, begin: int, count: int, length: int) -> Floats:

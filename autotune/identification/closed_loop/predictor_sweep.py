@@ -51,8 +51,16 @@ def innovations(F: FloatArray, H: FloatArray, x0: FloatArray, u: FloatArray, y: 
             for o in range(n_y):
                 value += F[i, n + n_u + o] * y[t, o]
             following[i] = value
-        x[:] = following
+        x, following = following, x
     return e
+
+
+@njit(cache=True)
+def _put_negative(values: FloatArray, row: FloatArray) -> None:
+    for i in range(
+        values.size
+    ):  # entry by entry: an assigned slice is compiled with the text of its error, for seconds
+        row[i] = -values[i]
 
 
 @njit(cache=True, fastmath={"contract", "nsz"})  # fused multiply-add only: NaN and order of sums are kept
@@ -98,17 +106,18 @@ def normal_equations(
     projection = np.zeros((width, P + 1))
     for i in range(n):
         for q in range(m):
-            projection[i * (m + 1) + q, :P] = -directions[i * m + q]
-        projection[i * (m + 1) + m, :P] = -directions[n * m + n_y * h + i]
+            _put_negative(directions[i * m + q], projection[i * (m + 1) + q])
+        _put_negative(directions[n * m + n_y * h + i], projection[i * (m + 1) + m])
     for r in range(n_y * h):
-        projection[n * (m + 1) + r, :P] = -directions[n * m + r]
+        _put_negative(directions[n * m + r], projection[n * (m + 1) + r])
     projection[width - 1, P] = 1.0
     C = np.ascontiguousarray(whitening @ np.ascontiguousarray(H[:, :n]))
     x, following, e = x0.copy(), np.empty(n), np.empty(n_y)
     phi, z = np.zeros(m + 1), np.ones(inputs)
     bank = np.zeros((n_y, n, m + 1))
     for o in range(n_y):
-        bank[o, :, m] = C[o]
+        for i in range(n):
+            bank[o, i, m] = C[o, i]
     moved = np.empty((n, m + 1))
     rows = np.zeros((_BLOCK * n_y, width))
     total = np.zeros((P + 1, P + 1))
@@ -149,14 +158,16 @@ def normal_equations(
                     a = F[k, i]
                     for q in range(m + 1):
                         moved[i, q] += a * bank[o, k, q]
-            bank[o] = moved
+            for i in range(n):
+                for q in range(m + 1):
+                    bank[o, i, q] = moved[i, q]
             filled += 1
         for i in range(n):
             value = 0.0
             for k in range(inputs):
                 value += F[i, k] * z[k]
             following[i] = value
-        x[:] = following
+        x, following = following, x
         if filled == rows.shape[0]:
             part = np.dot(rows, projection)
             total += np.dot(part.T, part)
