@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Console
 
 from autotune.cli import app
-from autotune.cli.init_keys import REGISTER, Table, add_registers, register, set_keys
+from autotune.cli.init_keys import REGISTER, Table, add_registers, set_keys
 from autotune.cli.init_model import EXAMPLE, ModelOfRig, model_of_rig
-from autotune.cli.init_questions import Questions, limits, middle, number, number_within, one_of, pair
+from autotune.cli.init_questions import Questions, one_of
+from autotune.cli.init_rig import ask_rig, ask_signals, config_of, round_to_two
 from autotune.cli.init_text import text_of
 from autotune.errors import InputError
 from autotune.outputs import Output
@@ -21,11 +22,6 @@ if TYPE_CHECKING:
     from drivers.kinds import Kind
 
 Plant = Literal["ball", "servo", "two_tank", "thermal"]
-
-_RANGE = "lowest and highest {} the rig may see"
-
-#: samples of a sweep: some 15 to 40 a period, a few periods for each of five points, and the way there
-SWEEP_SAMPLES = 1e4
 
 #: half-width of the noise of a twin's sensor, over the range of y, and steps of its converter over that range
 NOISE, CONVERTER = 1e-3, 4096
@@ -163,7 +159,7 @@ def init(
     else:
         given: Table = {"host": host, "device": device, "recording": recording, "y_span": y_span, "u_span": u_span}
         given |= {"endpoint": endpoint, "y_node": y_node, "u_node": u_node, "y_place": y_place, "u_place": u_place}
-        reached = _ask_rig(questions, chosen, given | {"y": y_register, "u": u_register})
+        reached = ask_rig(questions, chosen, given | {"y": y_register, "u": u_register})
         if registers and not chosen.has_registers:
             raise InputError(f'kind = "{chosen.name}" has no registers', where="--register", remedy="leave it out")
         add_registers(reached.get("registers", {}), registers or ())
@@ -179,10 +175,10 @@ def init(
             "u_range": u_range,
             "u_safe": u_safe,
         }
-        answers = _ask_signals(questions, told | {"y_range": y_range, "y": y, "u": u})
+        answers = ask_signals(questions, told | {"y_range": y_range, "y": y, "u": u})
         questions.require()
         played = _settings_of_twin(twin, config, answers)
-        content = _real(reached | (played if simulated else {"twin": played} if played else {}), answers)
+        content = config_of(reached | (played if simulated else {"twin": played} if played else {}), answers)
     content = {"name": config.stem, **content}
     set_keys(content, keys or ())
     validate(Config, content, str(config))
@@ -195,24 +191,6 @@ def init(
         console.print(f"next: autotune run {config} --out runs/{config.stem}", markup=False)
     else:
         console.print(f"next: read it through, then autotune doctor {config}, autotune probe {config}", markup=False)
-
-
-def _ask_signals(questions: Questions, given: Mapping[str, Any]) -> Table:
-    """Return units, control period, ranges and the operating point; what no flag says is asked."""
-    answers: Table = {
-        "u_unit": questions.ask("--u-unit", given["u_unit"], "unit of the command u", str, ""),
-        "y_unit": questions.ask("--y-unit", given["y_unit"], "unit of the measurement y", str, ""),
-        "sample_time_s": questions.ask("--sample-time", given["sample_time_s"], "control period [s], e.g. 0.1", number),
-        "u_range": questions.ask("--u-range", given["u_range"], f"{_RANGE.format('command u')}, e.g. 0 100", limits),
-    }
-    of_u = number_within(answers["u_range"])
-    answers["u_safe"] = questions.ask("--u-safe", given["u_safe"], "command at which the rig may be left alone", of_u)
-    answers["y_range"] = questions.ask("--y-range", given["y_range"], _RANGE.format("measurement y"), limits)
-    of_y, centre = number_within(answers["y_range"]), middle(answers["y_range"])
-    # y is chosen, its middle suggested; what command holds it there is known to the person alone
-    answers["y"] = questions.ask("--y", given["y"], "y of the operating point", of_y, suggested=centre)
-    answers["u"] = questions.ask("--u", given["u"], "command that holds it there, about", of_u)
-    return answers
 
 
 def _plant_or_model(answer: str) -> str | ModelOfRig:
@@ -235,76 +213,12 @@ def _settings_of_twin(twin: Plant | ModelOfRig | None, config: Path, answers: Ta
         span = abs(answers["y_range"][1] - answers["y_range"][0])
         return {
             "model": twin.path(config),
-            "noise": _round(NOISE * span),
-            "resolution": _round(span / CONVERTER),
+            "noise": round_to_two(NOISE * span),
+            "resolution": round_to_two(span / CONVERTER),
         }
     return {} if twin is None else {"plant": twin, **PLANTS[twin].get("rig", {})}
-
-
-#: what a kind may have to be told, in the order in which it is asked: its key, the question
-_ASKED = {
-    "host": "address of the device",
-    "endpoint": "address of the OPC UA server, opc.tcp://HOST:4840",
-    "device": "serial device (autotune ports lists them)",
-    "recording": "recording to replay, NAME.csv",
-    "y_span": "y at count 0 and at the converter's full scale",
-    "u_span": "u at duty 0 and at duty 1",
-}
-#: answers that follow a custom, to be looked at in the file
-_CUSTOM = {f"{which}_file": f"certificates/{name}" for which, name in
-           {"ca": "ca.pem", "cert": "host.pem", "key": "host.key", "server_cert": "server.pem"}.items()}  # fmt: skip
-
-
-def _ask_rig(questions: Questions, kind: Kind, given: Mapping[str, Any]) -> Table:
-    """Return the table [rig] of a rig that is there: what the settings of its kind have keys for is asked."""
-    keys = kind.settings.model_fields
-    rig: Table = {"kind": kind.name} | {key: name for key, name in _CUSTOM.items() if key in keys}
-    for key, question in _ASKED.items():
-        if key in keys:
-            convert = pair if key.endswith("_span") else str
-            rig[key] = questions.ask(f"--{key.replace('_', '-')}", given[key], question, convert)
-    if "nodes" in keys:
-        asked = "node of {}, its id or path of browse names, e.g. ns=2;s=Ball.{}"
-        rig["nodes"] = {one: questions.ask(f"--{one}-node", given[f"{one}_node"], asked.format(one, one), str)
-                        for one in ("y", "u")}  # fmt: skip
-    if "signals" in keys:
-        asked = "place of {} in the CPU, e.g. DB10.DBD{}"
-        rig["signals"] = {one: questions.ask(f"--{one}-place", given[f"{one}_place"], asked.format(one, at), str)
-                          for one, at in (("y", 0), ("u", 4))}  # fmt: skip
-    if kind.has_registers:
-        asked = "register of {}, TABLE:ADDRESS:TYPE, e.g. {}:0:int16"
-        y = questions.ask("--y-register", given["y"], asked.format("y", "input"), register)
-        u = questions.ask("--u-register", given["u"], asked.format("u", "holding"), register)
-        rig["registers"] = {"y": y, "u": u}
-    return rig
 
 
 def _simulated_config(plant: Plant) -> Table:
     known = dict(PLANTS[plant])
     return {"rig": {"kind": "simulated", "plant": plant, **known.pop("rig", {})}, **known}
-
-
-def _real(rig: Table, answers: Table) -> Table:
-    """Return the configuration of a real rig: what was answered, and cautious values that follow from it."""
-    u_min, u_max = answers["u_range"]
-    y_min, y_max = answers["y_range"]
-    room = min(answers["y"] - y_min, y_max - answers["y"])
-    if not room > 0.0:
-        raise InputError(f"y = {answers['y']:g} is not within {y_min:g}..{y_max:g}", where="operating_point.y")
-    # a quarter of the room leaves the rest to overshoot; rounded to what a person would have written
-    swing = _round(0.25 * room)
-    T_s = answers["sample_time_s"]
-    budget_s = max(60.0, _round(SWEEP_SAMPLES * T_s))
-    return {
-        "rig": rig,
-        "signals": {name: answers[name] for name in ("sample_time_s", "u_unit", "y_unit")},
-        "limits": {"u_min": u_min, "u_max": u_max, "u_safe": answers["u_safe"],
-                   "y_min": y_min, "y_max": y_max, "swing": swing, "time_s": 4.0 * budget_s},
-        "operating_point": {"y": answers["y"], "u_guess": answers["u"],
-                            "u_uncertainty": _round(0.05 * (u_max - u_min)), "approach": "hold"},
-        "experiment": {"points": 5, "budget_s": budget_s},
-    }  # fmt: skip
-
-
-def _round(value: float) -> float:
-    return float(f"{value:.2g}")

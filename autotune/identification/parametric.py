@@ -259,10 +259,9 @@ def _fit_from(
     bounds: tuple[FloatArray, FloatArray],
 ) -> OptimizeResult:
     """Fit one structure from lags that are these ratios of the middle period."""
-    middle = float(np.exp(np.mean(np.log(omega))))
+    middle, s = float(np.exp(np.mean(np.log(omega)))), 1j * omega
     start = np.array([0.0, *(math.log(ratio / middle) for ratio in ratios), 0.1 / middle])
     start[0] = float(np.mean(np.log(np.abs(measured / _response(omega, start, sign, integrating)))))
-    s = 1j * omega
 
     def residuals(x: FloatArray) -> FloatArray:
         return _whiten(_response(omega, x, sign, integrating) - measured, whitener)
