@@ -235,12 +235,10 @@ def _reduced_modulus(analysis: Analysis) -> float | None:
 def _outside(analysis: Analysis) -> str:
     """Return which loops stay outside the circle of the modulus margin, and what the others mean."""
     modulus, asked = _reduced_modulus(analysis), analysis.design.specification.modulus_margin
-    if modulus is None:
-        return "the loop stays outside the circle of the modulus margin"
-    if modulus > asked * (1.0 - _DRAWN):
-        return "the loops stay outside the circle of the modulus margin"
-    basis = basis_text(analysis)
-    words = f"the plant's loop stays outside the circle of the modulus margin; the controller was {basis}"
+    outside = "outside the circle of the modulus margin"
+    if modulus is None or modulus > asked * (1.0 - _DRAWN):
+        return f"the loop stays {outside}" if modulus is None else f"the loops stay {outside}"
+    words = f"the plant's loop stays {outside}; the controller was {basis_text(analysis)}"
     if modulus > 0.0:
         return f"{words}; the reduced model, which is more cautious, enters it (modulus margin {modulus:.2f})"
     return (
