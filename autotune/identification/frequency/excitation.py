@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
-from autotune.identification.frequency.limit_cycle import relay_edges
+from autotune.identification.frequency.limit_cycle import RelayEdges, relay_edges
 from autotune.recording import Recording
 
 #: Periods of one relay setting agree to this part.
@@ -32,7 +31,7 @@ def relay_segments(recording: Recording) -> tuple[tuple[float, float], ...]:
         edges = relay_edges(recording.t, recording.u)
     except IdentificationError:
         return _segments_by_level(recording)
-    return _regular_stretches(edges.times_s[edges.rising])
+    return _regular_stretches(edges)
 
 
 def _segments_of_sidecar(tables: list[Mapping[str, Any]], recording: Recording) -> tuple[tuple[float, float], ...]:
@@ -44,8 +43,12 @@ def _segments_of_sidecar(tables: list[Mapping[str, Any]], recording: Recording) 
     )
 
 
-def _regular_stretches(rises: FloatArray) -> tuple[tuple[float, float], ...]:
-    """Return maximal runs of periods within 15 % of their neighbour, the periods at both ends that differ left out."""
+def _regular_stretches(edges: RelayEdges) -> tuple[tuple[float, float], ...]:
+    """Return maximal runs of periods within 15 % of their neighbour, the periods at both ends that differ left out.
+
+    From rise to rise; where those from fall to fall are not alike, steps of many lengths have come at regular times.
+    """
+    rises, falls = edges.times_s[edges.rising], edges.times_s[~edges.rising]
     periods = np.diff(rises)
     found = []
     first = 0
@@ -59,7 +62,9 @@ def _regular_stretches(rises: FloatArray) -> tuple[tuple[float, float], ...]:
             low += high - low > _LEAST_PERIODS  # the first period still settles
             high -= high - low > _LEAST_PERIODS  # the last one may already belong to another setting
             margin = 0.02 * float(np.median(run))
-            if high - low >= _LEAST_PERIODS - 1:
+            between = np.diff(falls[(falls > rises[low]) & (falls < rises[high])])
+            alike = np.all(np.abs(between - np.median(run)) <= _SAME_PERIOD * np.median(run))
+            if high - low >= _LEAST_PERIODS - 1 and alike:
                 found.append((float(rises[low]) - margin, float(rises[high]) + margin))
         first = i
     return tuple(found)
@@ -81,7 +86,7 @@ def _segments_by_level(recording: Recording) -> tuple[tuple[float, float], ...]:
             edges = relay_edges(recording.t[low:high], recording.u[low:high])
         except IdentificationError:
             continue
-        found.extend(_regular_stretches(edges.times_s[edges.rising]))
+        found.extend(_regular_stretches(edges))
     return tuple(found)
 
 

@@ -279,3 +279,13 @@ def test_regions_hold_the_truth_under_autoregressive_noise_where_a_rough_model_f
     """Two lags, 400 records: .925 where noise is taken for equally large on all lines of a window."""
     shares = [float(by_points(600)(seed, 0.9)[0]) for seed in range(400)]
     assert 0.94 <= np.mean(shares) <= 0.97
+
+
+def test_steps_of_many_lengths_at_regular_times_are_no_limit_cycle() -> None:
+    """Every rise comes 21 s after the last, the falls do not: half of y lies between the harmonics of 21 s."""
+    lengths = [5.0, *(6.0 + 3.0 * (i % 4) for i in range(10))]
+    u = np.concatenate([np.full(round(10.0 * held), 10.0 * (i % 2 == 0 and i > 0)) for i, held in enumerate(lengths)])
+    t = 0.1 * np.arange(u.size)
+    noise = 0.01 * np.random.default_rng(10).standard_normal(u.size)
+    y = np.convolve(u, 0.08 * 0.05 * np.exp(-0.05 * np.arange(u.size)))[: u.size] + noise
+    assert frequency_points(Recording(t=t, u=u, y=y, name="steps")).excitation != "relay"
