@@ -116,13 +116,18 @@ class Table:
         return f"{name} [{unit}]" if unit and not bare_and_unit(name)[1] else name
 
 
+#: units that names of columns end in behind an underscore, as people write them there
+_ENDINGS = {"pct": "%", "percent": "%"} | {unit: unit for unit in ("mA", "degC", "degF", "mbar", "bar", "kPa", "rpm")}
+
+
 def bare_and_unit(name: str) -> tuple[str, str]:
-    """Return the name of a column and the unit in brackets behind it, empty where there is none."""
+    """Return the name of a column and its unit, in brackets or an underscore behind it; empty where there is none."""
     for left, right in (("[", "]"), ("(", ")"), ("{", "}")):
         if name.endswith(right) and left in name[1:]:
             at = name.rindex(left)
             return name[:at].strip(" _"), name[at + 1 : -1].strip()
-    return name.strip(), ""
+    bare, _, ending = name.strip().rpartition("_")
+    return (bare, _ENDINGS[ending]) if bare and ending in _ENDINGS else (name.strip(), "")
 
 
 def list_names(names: Iterable[str], most: int = 8) -> str:

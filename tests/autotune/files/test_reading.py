@@ -213,6 +213,11 @@ def test_the_words_of_a_column_and_the_letters_of_its_tag_say_what_it_is(tmp_pat
     np.testing.assert_allclose(recording.u, U)
 
 
+def test_units_at_the_end_of_names_are_units(tmp_path):
+    (recording,) = read_recordings(_columns(tmp_path / "a.csv", "t_ms;PT101_mA;YV101_pct", T, Y, U)).recordings
+    assert recording.metadata["units"] == {"u": "%", "y": "mA"}
+
+
 @pytest.mark.parametrize("header", ["Time;Input;Output;Setpoint", "t;in;out;sp", "Zeit;y;x;w"])
 @pytest.mark.parametrize("swapped", [False, True])
 def test_the_signal_that_keeps_to_the_set_point_is_the_measurement(tmp_path, header, swapped):
