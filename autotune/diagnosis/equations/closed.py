@@ -199,8 +199,8 @@ class ClosedBench(Bench):
 
     def _left_out(self, outcome: Outcome) -> Iterator[tuple[list[BoolArray], Outcome]]:
         """Yield the rows of each stretch, a mask per recording, and a fit moved to what the other rows say."""
-        rows = [len(r) for r in self.recordings]
-        labels = stretches_in(rows, [np.zeros(1, np.int64) for _ in rows], [np.array([n]) for n in rows])
+        y = [r.y for r in self.recordings]
+        labels = stretches_in(y, [np.zeros(1, np.int64) for _ in y], [np.array([one.size]) for one in y])
         for k in range(1 + max(int(label.max(initial=-1)) for label in labels)):
             kept = [ok & (label != k) for ok, label in zip(self._rows, labels, strict=True)]
             yield [label == k for label in labels], self._fit(outcome.effects, outcome, 1, kept)

@@ -157,7 +157,7 @@ class EquationBench(Bench):
 
     def _stretches(self, outcome: Outcome) -> list[IntArray]:
         windows = outcome.fitted.windows
-        return stretches_in([len(r) for r in self.recordings], [w.starts for w in windows], [w.stops for w in windows])
+        return stretches_in([r.y for r in self.recordings], [w.starts for w in windows], [w.stops for w in windows])
 
     def _compiled(self, effects: Sequence[Effect]) -> Compiled:
         compiled, own = compile_with(self.model, effects), self._own

@@ -20,9 +20,8 @@ from autotune.diagnosis.fitting.long_windows import spread_of
 
 #: Stretches that are left out, one after the other.
 STRETCHES = 8
-#: First share of every window that tells its start state and is never judged, and rows of it at least: of long windows,
-#: and of many short ones.
-HEAD, LARGE_HEAD, LEAST_HEAD = 0.12, 0.35, 8
+#: Rows of every window that tell its start state and are never judged; of many short windows a share of each.
+LEAST_HEAD, LARGE_HEAD = 8, 0.35
 #: Steps of the numbers that each left-out stretch is worth, with the derivatives of the fit to all.
 STEPS = 3
 #: Spreads of y that an error counts as at most: where a simulation runs away, how far does not matter.
@@ -31,16 +30,21 @@ FAR_OFF = 10.0
 
 def stretches_of(data: Data) -> list[IntArray]:
     """Return the number of the stretch that every row belongs to, per recording; -1 for what is never judged."""
-    return stretches_in([len(r) for r in data.recordings], data.starts, data.stops)
+    return stretches_in([r.y for r in data.recordings], data.starts, data.stops)
 
 
-def stretches_in(rows: Sequence[int], firsts: Sequence[IntArray], ends: Sequence[IntArray]) -> list[IntArray]:
-    """Return the same from the rows of each recording and its windows: first rows, and rows before which they end."""
-    labels = []
+def stretches_in(
+    readings: Sequence[FloatArray], firsts: Sequence[IntArray], ends: Sequence[IntArray]
+) -> list[IntArray]:
+    """Return the same from the readings of each recording and its windows: first rows, and rows before which they end.
+
+    Where there are fewer windows than stretches these end where each has told as much, see :func:`told_by`.
+    """
+    labels, weights = [], [told_by(y) for y in readings]
     windows = sum(len(a) for a in firsts)
-    share = LARGE_HEAD if windows >= STRETCHES else HEAD
-    for count, starts, stops in zip(rows, firsts, ends, strict=True):
-        label = np.full(count, -1, dtype=np.int64)
+    share = LARGE_HEAD if windows >= STRETCHES else 0.0
+    for y, starts, stops in zip(readings, firsts, ends, strict=True):
+        label = np.full(y.size, -1, dtype=np.int64)
         for a, b in zip(starts, stops, strict=True):
             label[a + max(LEAST_HEAD, int(share * (b - a))) : b] = 0
         labels.append(label)
@@ -52,12 +56,45 @@ def stretches_in(rows: Sequence[int], firsts: Sequence[IntArray], ends: Sequence
                 part[part >= 0] = number * STRETCHES // windows
                 number += 1
         return labels
-    total, before = sum(int((label >= 0).sum()) for label in labels), 0
-    for label in labels:
-        judged = np.flatnonzero(label >= 0)
-        label[judged] = (before + np.arange(judged.size)) * STRETCHES // max(total, 1)
-        before += judged.size
+    total = sum(float(w[label >= 0].sum()) for label, w in zip(labels, weights, strict=True))
+    before = 0.0
+    for label, w in zip(labels, weights, strict=True):
+        judged = label >= 0
+        told = before + np.cumsum(w[judged])
+        label[judged] = np.minimum((told - 0.5 * w[judged]) / total * STRETCHES, STRETCHES - 1).astype(np.int64)
+        before = float(told[-1]) if told.size else before
     return labels
+
+
+def told_by(y: FloatArray) -> FloatArray:
+    """Return how much each row of a recording tells, in rows: half as a row, half by how fast y moves there.
+
+    Parameters
+    ----------
+    y : (N,) array
+        Readings; NaN where there is none.
+
+    Returns
+    -------
+    (N,) array
+        Its mean is 1.
+
+    Notes
+    -----
+    What a row tells of a delay L is the square of dy/dL, the speed of y; of a gain or a load each row tells about as
+    much. The response to a step in a long record is a few rows of many: stretches of as many rows each would have one
+    witness of it beside seven of what rests. The speed is that over a hundredth of the record, whose noise is small.
+    """
+    good = np.isfinite(y)
+    rows = np.arange(y.size)
+    if not good.any():
+        return np.ones(y.size)
+    filled = np.interp(rows, rows[good], y[good])
+    apart = max(1, y.size // 100)
+    ahead, behind = np.minimum(rows + apart, y.size - 1), np.maximum(rows - apart, 0)
+    squares = ((filled[ahead] - filled[behind]) / (ahead - behind)) ** 2
+    mean = float(squares.mean())
+    return 0.5 + 0.5 * squares / mean if mean > 0.0 else np.ones(y.size)
 
 
 def held_out_squares(result: Fit, data: Data) -> FloatArray:

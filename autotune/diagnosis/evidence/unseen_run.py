@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
-from autotune.diagnosis.evidence.stretches import HEAD, LARGE_HEAD, LEAST_HEAD
+from autotune.diagnosis.evidence.stretches import LARGE_HEAD, LEAST_HEAD
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, states_of
 from autotune.diagnosis.fitting.long_windows import lengths_of
@@ -153,7 +153,7 @@ def _heads(data: Data, number: int, first: int, last: int, retuned: Fit) -> Data
     edges = np.linspace(first, last, count + 1).round().astype(np.int64)
     told = np.zeros(ok.size, dtype=bool)
     for a, b in pairwise(edges):
-        told[a : a + max(LEAST_HEAD, int((HEAD if count == 1 else LARGE_HEAD) * (b - a)))] = True
+        told[a : a + max(LEAST_HEAD, int(LARGE_HEAD * (b - a)) if count > 1 else 0)] = True
     return replace(
         data,
         recordings=(r,),

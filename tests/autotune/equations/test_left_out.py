@@ -27,7 +27,7 @@ def recorded(truth: EquationModel, seed: int) -> Recording:
 
 def squares(model: EquationModel, pair: list[Recording]) -> tuple[np.ndarray, int]:
     found = fit(compile_model(model), pair, horizon_s=15.0)
-    labels = stretches_in([ROWS] * 2, [w.starts for w in found.windows], [w.stops for w in found.windows])
+    labels = stretches_in([r.y for r in pair], [w.starts for w in found.windows], [w.stops for w in found.windows])
     return left_out_squares(found, pair, labels), sum(int((label >= 0).sum()) for label in labels)
 
 

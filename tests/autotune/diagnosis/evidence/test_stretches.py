@@ -6,8 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from autotune.diagnosis.evidence.stretches import correlation_rows, held_out_squares, stretches_of
+from autotune.diagnosis.evidence.stretches import (
+    correlation_rows,
+    held_out_squares,
+    stretches_of,
+    told_by,
+)
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.long_windows import cut
 from autotune.diagnosis.fitting.parameters import parametrise
@@ -37,8 +44,41 @@ def test_slow_errors_count_as_few_rows_and_white_ones_as_many():
 def test_the_head_of_every_window_is_never_judged_and_all_stretches_are():
     _, data, _ = _fitted(np.zeros(2000))
     labels = np.concatenate(stretches_of(data))
-    assert np.all(labels[: len(labels) // 10] == -1)
-    assert set(labels) == {-1, *range(8)}
+    assert np.all(labels[:8] == -1)
+    assert set(labels[8:]) == set(range(8))
+    assert np.all(np.diff(labels[8:]) >= 0)
+
+
+@given(size=st.floats(1e-6, 1e6), shift=st.floats(-1e3, 1e3))
+def test_what_rows_tell_does_not_hang_on_units(size: float, shift: float):
+    y = np.random.default_rng(0).normal(size=500).cumsum()
+    assert told_by(size * (y + shift)) == pytest.approx(told_by(y), rel=1e-6)
+
+
+def test_rows_tell_as_much_as_each_other_where_y_moves_evenly_or_is_noise():
+    noise = np.random.default_rng(0).normal(size=8000)
+    assert told_by(3.0 * np.arange(1000.0)) == pytest.approx(1.0)
+    assert told_by(np.full(1000, 2.0)) == pytest.approx(1.0)
+    assert told_by(noise).reshape(8, -1).mean(axis=1) == pytest.approx(1.0, abs=0.1)
+
+
+def test_gaps_in_the_readings_tell_what_lies_around_them():
+    y = np.cumsum(np.random.default_rng(0).normal(size=1000))
+    gaps = np.where(np.arange(1000) % 7 == 3, np.nan, y)
+    assert told_by(gaps).mean() == pytest.approx(1.0)
+    assert told_by(np.full(100, np.nan)) == pytest.approx(1.0)
+
+
+def test_a_step_response_in_a_long_record_has_more_than_one_witness():
+    """A lag of a fifth of the plant's own shows in forty rows of two thousand, and the rest rests."""
+    u = np.where(np.arange(2000) < 200, 0.0, 1.0)
+    errors = np.random.default_rng(3).normal(0.0, 0.002, 2000)
+    _, data, without = _fitted(errors, u=u, lag_s=0.4)
+    labels = np.concatenate(stretches_of(data))
+    assert np.unique(labels[200:260]).size >= 3
+    right = fit(parametrise(_lags(2.0, 0.4), [], 0.5, 0.1), data)
+    said = np.log(held_out_squares(without, data) / held_out_squares(right, data))
+    assert np.sum(said > 1.0) >= 3
 
 
 def test_left_out_errors_of_the_true_model_are_its_noise():
@@ -49,17 +89,23 @@ def test_left_out_errors_of_the_true_model_are_its_noise():
     assert np.sqrt(squares.sum() / np.sum(labels >= 0)) == pytest.approx(0.05, rel=0.08)
 
 
-def _fitted(errors):
-    """Return a first-order lag with errors on its reading, in one long window, fitted."""
+def _fitted(errors, u=None, lag_s=0.0):
+    """Return a first-order lag, behind a further one if asked, with errors on its reading, in one window, fitted."""
     n, dt, T = errors.size, 0.1, 2.0
     rng = np.random.default_rng(0)
-    u = np.repeat(rng.uniform(-1.0, 1.0, n // 40), 40)
-    y, x, decay = np.zeros(n), 0.0, np.exp(-dt / T)
+    u = np.repeat(rng.uniform(-1.0, 1.0, n // 40), 40) if u is None else u
+    y, x, drive = np.zeros(n), 0.0, 0.0
+    decay, lag = np.exp(-dt / T), np.exp(-dt / lag_s) if lag_s else 0.0
     for k in range(n):
         y[k] = x
-        x = decay * x + (1.0 - decay) * u[k]
+        drive = lag * drive + (1.0 - lag) * u[k]
+        x = decay * x + (1.0 - decay) * drive
     recording = Recording(t=dt * np.arange(n), u=u, y=y + errors)
-    block = Block(name="lag", place="plant", dynamics=TransferFunction(num=(1.0,), den=(T, 1.0)))
-    model = Model(name="lag", input=Port(), output=Port(), blocks=(block,))
     data = cut([recording], [np.ones(n, dtype=bool)], recording.duration_s, IN_USE)
-    return recording, data, fit(parametrise(model, [], 0.5, dt), data)
+    return recording, data, fit(parametrise(_lags(T), [], 0.5, dt), data)
+
+
+def _lags(*times_s):
+    lags = (TransferFunction(num=(1.0,), den=(T, 1.0)) for T in times_s)
+    blocks = tuple(Block(name=f"lag {k}", place="plant", dynamics=lag) for k, lag in enumerate(lags))
+    return Model(name="lags", input=Port(), output=Port(), blocks=blocks)
