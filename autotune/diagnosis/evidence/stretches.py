@@ -30,7 +30,8 @@ FAR_OFF = 10.0
 
 def stretches_of(data: Data) -> list[IntArray]:
     """Return the number of the stretch that every row belongs to, per recording; -1 for what is never judged."""
-    return stretches_in([r.y for r in data.recordings], data.starts, data.stops)
+    readings = [np.where(good, r.y, np.nan) for r, good in zip(data.recordings, data.good, strict=True)]
+    return stretches_in(readings, data.starts, data.stops)
 
 
 def stretches_in(
