@@ -15,7 +15,9 @@ from autotune.equations.simulate import drive_of
 from autotune.recording import Recording
 
 
-def left_out_squares(fitted: Fitted, recordings: Sequence[Recording], labels: Sequence[IntArray]) -> FloatArray:
+def left_out_squares(
+    fitted: Fitted, recordings: Sequence[Recording], labels: Sequence[IntArray], count: int
+) -> FloatArray:
     """Return the sum of squared errors on every stretch, with numbers fitted to the others.
 
     Parameters
@@ -26,6 +28,8 @@ def left_out_squares(fitted: Fitted, recordings: Sequence[Recording], labels: Se
         What it was fitted to; rows whose y is no number do not count.
     labels : sequence of (N,) int arrays
         Which stretch each row belongs to, counted from 0; -1 for what is never left out.
+    count : int
+        Number K of stretches.
 
     Returns
     -------
@@ -37,8 +41,8 @@ def left_out_squares(fitted: Fitted, recordings: Sequence[Recording], labels: Se
     Numbers and start states move by one Gauss-Newton step with the derivatives of the fit to all rows: first order, so
     that a stretch on which alone a threshold was felt is judged a little too well.
     """
-    squares = np.zeros(1 + max(int(label.max(initial=-1)) for label in labels))
-    for k, there in _refit_without(fitted, recordings, labels, squares.size):
+    squares = np.zeros(count)
+    for k, there in _refit_without(fitted, recordings, labels, count):
         squares[k] = _squares(there.simulated(), recordings, labels, k)
     return squares
 

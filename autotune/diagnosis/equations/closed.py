@@ -13,7 +13,7 @@ from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import Signals
 from autotune.diagnosis.equations.held_out import HELD_OUT
 from autotune.diagnosis.equations.sought import jumping, scale_parameter
-from autotune.diagnosis.evidence.stretches import stretches_in
+from autotune.diagnosis.evidence.stretches import cuttings_in
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.effects.in_equations import Scales
 from autotune.equations.black_box import BlackBox, driven, read_out
@@ -200,7 +200,7 @@ class ClosedBench(Bench):
     def _left_out(self, outcome: Outcome) -> Iterator[tuple[list[BoolArray], Outcome]]:
         """Yield the rows of each stretch, a mask per recording, and a fit moved to what the other rows say."""
         y = [r.y for r in self.recordings]
-        labels = stretches_in(y, [np.zeros(1, np.int64) for _ in y], [np.array([one.size]) for one in y])
+        labels, *_ = cuttings_in(y, [np.zeros(1, np.int64) for _ in y], [np.array([one.size]) for one in y])
         for k in range(1 + max(int(label.max(initial=-1)) for label in labels)):
             kept = [ok & (label != k) for ok, label in zip(self._rows, labels, strict=True)]
             yield [label == k for label in labels], self._fit(outcome.effects, outcome, 1, kept)

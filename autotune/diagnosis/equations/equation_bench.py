@@ -19,7 +19,7 @@ from autotune.diagnosis.equations.further import further_columns
 from autotune.diagnosis.equations.held_out import HELD_OUT, bounded_errors, forecasts, free_run, until
 from autotune.diagnosis.equations.parts import standing_out, telling_windows
 from autotune.diagnosis.equations.sought import change_number, outer, scale_parameter
-from autotune.diagnosis.evidence.stretches import stretches_in
+from autotune.diagnosis.evidence.stretches import STRETCHES, cuttings_in
 from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.effects import KINDS
 from autotune.effects.in_equations import Scales
@@ -149,15 +149,16 @@ class EquationBench(Bench):
 
     def left_out_squares(self, outcome: Outcome) -> FloatArray:
         """Return squared errors on stretches, the numbers fitted to the other ones."""
-        return left_out_squares(outcome.fitted, self.recordings, self._stretches(outcome))
+        cuttings = self._cuttings(outcome)
+        return np.array([left_out_squares(outcome.fitted, self.recordings, one, STRETCHES) for one in cuttings])
 
     def error_beside_still(self, outcome: Outcome) -> float | None:
         """Return the error there as a share of what it is with inputs that stand still; None where none moves."""
-        return error_beside_still(outcome.fitted, self.recordings, self._stretches(outcome))
+        return error_beside_still(outcome.fitted, self.recordings, self._cuttings(outcome)[0])
 
-    def _stretches(self, outcome: Outcome) -> list[IntArray]:
+    def _cuttings(self, outcome: Outcome) -> list[list[IntArray]]:
         windows = outcome.fitted.windows
-        return stretches_in([r.y for r in self.recordings], [w.starts for w in windows], [w.stops for w in windows])
+        return cuttings_in([r.y for r in self.recordings], [w.starts for w in windows], [w.stops for w in windows])
 
     def _compiled(self, effects: Sequence[Effect]) -> Compiled:
         compiled, own = compile_with(self.model, effects), self._own

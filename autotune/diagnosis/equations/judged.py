@@ -14,7 +14,7 @@ from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import key_of
 from autotune.diagnosis.equations.scores import innovations_variance, is_noise, is_slow, noise_of
 from autotune.diagnosis.fitting.noise import Noise
-from autotune.diagnosis.selection.judged import Judged
+from autotune.diagnosis.selection.judged import Judged, total
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import kind_of
 from autotune.effects.base import PRIOR_ODDS
@@ -65,7 +65,7 @@ class JudgedEquations(Judged):
         most = limits.adequate_quick + math.sqrt(2.0 / outcome.residual.size)
         if not is_noise(self.bench, outcome, most) or is_slow(outcome, self.noise, limits):
             return False
-        error = math.sqrt(float(self.long_squares.sum()) / outcome.residual.size)
+        error = math.sqrt(total(self.long_squares) / outcome.residual.size)
         return error < limits.foretold * self.bench.grows * math.sqrt(outcome.rss / outcome.residual.size)
 
     @cached_property

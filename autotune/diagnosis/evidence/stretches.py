@@ -28,42 +28,53 @@ STEPS = 3
 FAR_OFF = 10.0
 
 
-def stretches_of(data: Data) -> list[IntArray]:
-    """Return the number of the stretch that every row belongs to, per recording; -1 for what is never judged."""
+def cuttings_of(data: Data) -> list[list[IntArray]]:
+    """Return the number of the stretch that every row belongs to, per recording; -1 for what is never judged.
+
+    Several times, as :func:`cuttings_in` does.
+    """
     readings = [np.where(good, r.y, np.nan) for r, good in zip(data.recordings, data.good, strict=True)]
-    return stretches_in(readings, data.starts, data.stops)
+    return cuttings_in(readings, data.starts, data.stops)
 
 
-def stretches_in(
+def cuttings_in(
     readings: Sequence[FloatArray], firsts: Sequence[IntArray], ends: Sequence[IntArray]
-) -> list[IntArray]:
+) -> list[list[IntArray]]:
     """Return the same from the readings of each recording and its windows: first rows, and rows before which they end.
 
-    Where there are fewer windows than stretches these end where each has told as much, see :func:`told_by`.
+    Where windows are many a stretch is some of them. Else the rows are cut twice: into stretches of as many rows each,
+    and into those that tell as much each, see :func:`told_by`.
     """
-    labels, weights = [], [told_by(y) for y in readings]
     windows = sum(len(a) for a in firsts)
     share = LARGE_HEAD if windows >= STRETCHES else 0.0
+    judged = []
     for y, starts, stops in zip(readings, firsts, ends, strict=True):
-        label = np.full(y.size, -1, dtype=np.int64)
+        rows = np.zeros(y.size, dtype=bool)
         for a, b in zip(starts, stops, strict=True):
-            label[a + max(LEAST_HEAD, int(share * (b - a))) : b] = 0
+            rows[a + max(LEAST_HEAD, int(share * (b - a))) : b] = True
+        judged.append(rows)
+    if windows < STRETCHES:
+        return [_cut(judged, [np.ones(y.size) for y in readings]), _cut(judged, [told_by(y) for y in readings])]
+    number, labels = 0, []
+    for rows, starts, stops in zip(judged, firsts, ends, strict=True):
+        label = np.full(rows.size, -1, dtype=np.int64)
+        for a, b in zip(starts, stops, strict=True):
+            label[a:b] = np.where(rows[a:b], number * STRETCHES // windows, -1)
+            number += 1
         labels.append(label)
-    if windows >= STRETCHES:
-        number = 0
-        for label, starts, stops in zip(labels, firsts, ends, strict=True):
-            for a, b in zip(starts, stops, strict=True):
-                part = label[a:b]
-                part[part >= 0] = number * STRETCHES // windows
-                number += 1
-        return labels
-    total = sum(float(w[label >= 0].sum()) for label, w in zip(labels, weights, strict=True))
-    before = 0.0
-    for label, w in zip(labels, weights, strict=True):
-        judged = label >= 0
-        told = before + np.cumsum(w[judged])
-        label[judged] = np.minimum((told - 0.5 * w[judged]) / total * STRETCHES, STRETCHES - 1).astype(np.int64)
+    return [labels]
+
+
+def _cut(judged: Sequence[BoolArray], weights: Sequence[FloatArray]) -> list[IntArray]:
+    """Return the stretch of every row that is judged, stretches of as much weight each; -1 of the others."""
+    total = sum(float(w[rows].sum()) for rows, w in zip(judged, weights, strict=True))
+    labels, before = [], 0.0
+    for rows, w in zip(judged, weights, strict=True):
+        label = np.full(rows.size, -1, dtype=np.int64)
+        told = before + np.cumsum(w[rows])
+        label[rows] = np.minimum((told - 0.5 * w[rows]) / total * STRETCHES, STRETCHES - 1).astype(np.int64)
         before = float(told[-1]) if told.size else before
+        labels.append(label)
     return labels
 
 
@@ -110,8 +121,9 @@ def held_out_squares(result: Fit, data: Data) -> FloatArray:
 
     Returns
     -------
-    (STRETCHES,) array
-        In the reading's unit squared; as of errors of ten spreads of y where a simulation runs away.
+    (C, STRETCHES) array
+        For each of the C ways in which rows are cut, in the reading's unit squared; as of errors of ten spreads of y
+        where a simulation runs away.
 
     Notes
     -----
@@ -119,11 +131,11 @@ def held_out_squares(result: Fit, data: Data) -> FloatArray:
     window's first rows say of its start state is always known. With thresholds that is first order: a stretch on which
     a threshold alone was felt is judged a little too well.
     """
-    squares, good = np.zeros(STRETCHES), np.concatenate(data.good)
-    for k, out, there, _ in _left_out(result, data):
+    squares, good = [], np.concatenate(data.good)
+    for out, there, _ in _left_out(result, data):
         most = float(np.sum(good & out)) * (FAR_OFF * spread_of(data)) ** 2
-        squares[k] = most if there is None else min(float(there.e[out] @ there.e[out]) * data.noise.sd**2, most)
-    return squares
+        squares.append(most if there is None else min(float(there.e[out] @ there.e[out]) * data.noise.sd**2, most))
+    return np.reshape(squares, (-1, STRETCHES))
 
 
 def error_beside_still(result: Fit, data: Data) -> float | None:
@@ -140,10 +152,10 @@ def error_beside_still(result: Fit, data: Data) -> float | None:
         Of the stretches in which a command moves, from a state that the rows before them tell; None where none does.
     """
     own = still = 0.0
-    labels = stretches_of(data)
-    for k, out, there, problem in _left_out(result, data):
-        pairs = enumerate(zip(data.driving, labels, strict=True))
-        driving = [r.standing_still(data.in_driving(i, label == k)) for i, (r, label) in pairs]
+    ends = np.cumsum([len(r) for r in data.recordings])[:-1]
+    for out, there, problem in _left_out(result, data):
+        pairs = enumerate(zip(data.driving, np.split(out, ends), strict=True))
+        driving = [r.standing_still(data.in_driving(i, rows)) for i, (r, rows) in pairs]
         if there is None or all(one is r for one, r in zip(driving, data.driving, strict=True)):
             continue
         beside = try_point(Problem(problem.parametrisation, data.driven_by(driving)), there.theta, there.x0)
@@ -152,18 +164,18 @@ def error_beside_still(result: Fit, data: Data) -> float | None:
     return math.sqrt(own / still) if still > 0.0 else None
 
 
-def _left_out(result: Fit, data: Data) -> Iterator[tuple[int, BoolArray, Iterate | None, Problem]]:
-    """Yield each stretch's number and rows, and where a fit to the others goes; None where it runs away."""
-    labels = np.concatenate(stretches_of(data))
+def _left_out(result: Fit, data: Data) -> Iterator[tuple[BoolArray, Iterate | None, Problem]]:
+    """Yield each stretch's rows, and where a fit to the others goes; None where it runs away."""
     problem = Problem(result.parametrisation, data)
     problem.scales = result.sim.state_sizes(
         [r.u for r in data.driving], [r.y[g] for r, g in zip(data.recordings, data.good, strict=True)]
     )
     start = problem.iterate(result.theta, [x.copy() for x in result.x0])
     J, Jx = result.jacobian[0], problem.jacobian(start, np.zeros(result.theta.size, dtype=bool))[1]
-    for k in range(STRETCHES):
-        out = labels == k
-        yield k, out, _without(problem, start, (J, Jx), out), problem
+    for labels in cuttings_of(data):
+        number = np.concatenate(labels)
+        for k in range(STRETCHES):
+            yield number == k, _without(problem, start, (J, Jx), number == k), problem
 
 
 def _without(
@@ -224,6 +236,6 @@ def rms(residuals: Sequence[FloatArray], good: Sequence[BoolArray]) -> float:
 
 
 def judged_rows(data: Data) -> int:
-    """Return how many rows are judged."""
-    pairs = zip(stretches_of(data), data.good, strict=True)
+    """Return how many rows are judged: as many whichever way they are cut."""
+    pairs = zip(cuttings_of(data)[0], data.good, strict=True)
     return max(1, sum(int(((label >= 0) & good).sum()) for label, good in pairs))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -231,7 +232,8 @@ def _starts(base: JudgedChain, bench: Bench) -> list[_Start]:
     """
     scales = [(base.fit, bench.long)]
     if bench.has_shorter and base.error > bench.limits.out_of_phase:
-        scales.append((bench.shortened(base.fit), bench.few))
+        with suppress(*RUNAWAY):
+            scales.append((bench.shortened(base.fit), bench.few))
     taken = related_effects(base.names)
     tried = [
         (kind, odds, near, data)

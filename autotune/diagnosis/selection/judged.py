@@ -34,8 +34,8 @@ class Judged(ABC):
     ----------
     names : tuple of str
         Its effects.
-    long_squares, short_squares : (K,) array
-        Squared errors on left-out stretches, of fits to long windows and to short ones.
+    long_squares, short_squares : (C, K) array
+        Squared errors on K left-out stretches, for each of C ways to cut them, of fits to long windows and short ones.
     log_odds : float
         Logarithm of its prior odds.
     """
@@ -110,8 +110,8 @@ class Judged(ABC):
 
     @cached_property
     def log_squares(self) -> float:
-        """Logarithm of its squared errors, the mean of all left-out stretches and of both scales."""
-        return float(np.mean(np.log(np.concatenate([self.long_squares, self.short_squares]) + TINY)))
+        """Logarithm of its squared errors: the mean of all left-out stretches, however cut, and of both scales."""
+        return float(np.mean([np.mean(np.log(s + TINY)) for s in (self.long_squares, self.short_squares)]))
 
     def behind(self, other: Judged) -> float:
         """Return twice the logarithm of the odds that another hypothesis is the better one, priors counted.
@@ -156,6 +156,11 @@ class Judged(ABC):
 
 
 _J = TypeVar("_J", bound=Judged)
+
+
+def total(squares: FloatArray) -> float:
+    """Return the sum of squared errors on all left-out stretches: the mean of the ways to cut them."""
+    return float(np.mean(np.sum(squares, axis=-1)))
 
 
 def worst(one: Judged, others: Sequence[Judged]) -> float:

@@ -19,7 +19,7 @@ from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.retuning import reduced_chi2, under_noise
 from autotune.diagnosis.fitting.spreading import spread_out
 from autotune.diagnosis.selection.hypothesis import Hypothesis
-from autotune.diagnosis.selection.judged import Judged
+from autotune.diagnosis.selection.judged import Judged, total
 from autotune.diagnosis.selection.prediction import extend
 from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.selection.searched import Search
@@ -85,7 +85,7 @@ class JudgedChain(Judged):
         both = ((self.fit, self.data, self.long_squares), (self.short, self.few, self.short_squares))
         return all(
             is_noise(result, data)
-            and math.sqrt(float(squares.sum()) / judged_rows(data))
+            and math.sqrt(total(squares) / judged_rows(data))
             < data.thresholds.foretold * rms(result.residuals, data.good)
             for result, data, squares in both
         )
@@ -116,7 +116,7 @@ class JudgedChain(Judged):
     @property
     def error(self) -> float:
         """Held-out error of the free run as a share of the spread of y."""
-        return math.sqrt(float(self.long_squares.sum()) / judged_rows(self.data)) / spread_of(self.data)
+        return math.sqrt(total(self.long_squares) / judged_rows(self.data)) / spread_of(self.data)
 
 
 def at_both_scales(one: JudgedChain, found: Sequence[JudgedChain]) -> JudgedChain:

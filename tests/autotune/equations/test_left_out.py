@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from autotune.diagnosis.evidence.stretches import STRETCHES, stretches_in
+from autotune.diagnosis.evidence.stretches import STRETCHES, cuttings_in
 from autotune.equations import Drive, EquationModel, compile_model, fit, simulate
 from autotune.equations.left_out import left_out_squares
 from autotune.recording import Recording
@@ -27,8 +27,8 @@ def recorded(truth: EquationModel, seed: int) -> Recording:
 
 def squares(model: EquationModel, pair: list[Recording]) -> tuple[np.ndarray, int]:
     found = fit(compile_model(model), pair, horizon_s=15.0)
-    labels = stretches_in([r.y for r in pair], [w.starts for w in found.windows], [w.stops for w in found.windows])
-    return left_out_squares(found, pair, labels), sum(int((label >= 0).sum()) for label in labels)
+    labels, *_ = cuttings_in([r.y for r in pair], [w.starts for w in found.windows], [w.stops for w in found.windows])
+    return left_out_squares(found, pair, labels, STRETCHES), sum(int((label >= 0).sum()) for label in labels)
 
 
 @pytest.fixture(scope="module")
@@ -59,5 +59,5 @@ def test_what_tells_of_nothing_else_is_judged_as_unseen() -> None:
     found = fit(compiled, [r])
     assert found.parameters[2] == pytest.approx(0.3, rel=0.05)
     label = np.where(r.t >= 30.0, 0, -1)
-    left = left_out_squares(found, [r], [label])
+    left = left_out_squares(found, [r], [label], 1)
     assert left[0] / (label == 0).sum() > 10.0 * SD**2

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from autotune.diagnosis.evidence.stretches import (
     correlation_rows,
+    cuttings_of,
     held_out_squares,
-    stretches_of,
     told_by,
 )
 from autotune.diagnosis.fitting.fit import fit
@@ -28,8 +28,8 @@ def test_where_a_simulation_runs_away_every_row_counts_as_ten_spreads():
     gain = [f.kind == "gain" for f in result.parametrisation.free]
     stuck = np.zeros_like(result.jacobian[0])
     astray = replace(result, theta=result.theta + 20.0 * np.array(gain), jacobian=(stuck, *result.jacobian[1:]))
-    judged = np.sum(np.concatenate(stretches_of(data)) >= 0)
-    assert held_out_squares(astray, data).sum() == pytest.approx(judged * (10.0 * np.std(recording.y)) ** 2)
+    judged = np.sum(np.concatenate(cuttings_of(data)[0]) >= 0)
+    assert held_out_squares(astray, data).sum(axis=1) == pytest.approx(judged * (10.0 * np.std(recording.y)) ** 2)
 
 
 def test_slow_errors_count_as_few_rows_and_white_ones_as_many():
@@ -43,10 +43,12 @@ def test_slow_errors_count_as_few_rows_and_white_ones_as_many():
 
 def test_the_head_of_every_window_is_never_judged_and_all_stretches_are():
     _, data, _ = _fitted(np.zeros(2000))
-    labels = np.concatenate(stretches_of(data))
-    assert np.all(labels[:8] == -1)
-    assert set(labels[8:]) == set(range(8))
-    assert np.all(np.diff(labels[8:]) >= 0)
+    by_rows, by_speed = (np.concatenate(labels) for labels in cuttings_of(data))
+    for labels in (by_rows, by_speed):
+        assert np.all(labels[:8] == -1)
+        assert set(labels[8:]) == set(range(8))
+        assert np.all(np.diff(labels[8:]) >= 0)
+    assert np.ptp(np.bincount(by_rows[8:])) <= 1
 
 
 @given(size=st.floats(1e-6, 1e6), shift=st.floats(-1e3, 1e3))
@@ -74,19 +76,19 @@ def test_a_step_response_in_a_long_record_has_more_than_one_witness():
     u = np.where(np.arange(2000) < 200, 0.0, 1.0)
     errors = np.random.default_rng(3).normal(0.0, 0.002, 2000)
     _, data, without = _fitted(errors, u=u, lag_s=0.4)
-    labels = np.concatenate(stretches_of(data))
-    assert np.unique(labels[200:260]).size >= 3
+    by_rows, by_speed = (np.concatenate(labels) for labels in cuttings_of(data))
+    assert np.unique(by_rows[200:250]).size == 1
+    assert np.unique(by_speed[200:250]).size >= 3
     right = fit(parametrise(_lags(2.0, 0.4), [], 0.5, 0.1), data)
     said = np.log(held_out_squares(without, data) / held_out_squares(right, data))
-    assert np.sum(said > 1.0) >= 3
+    assert np.sum(said > 1.0, axis=1)[1] >= 3 > np.sum(said > 1.0, axis=1)[0]
 
 
 def test_left_out_errors_of_the_true_model_are_its_noise():
     rng = np.random.default_rng(2)
     _, data, result = _fitted(rng.normal(0.0, 0.05, 2000))
-    labels = np.concatenate(stretches_of(data))
-    squares = held_out_squares(result, data)
-    assert np.sqrt(squares.sum() / np.sum(labels >= 0)) == pytest.approx(0.05, rel=0.08)
+    judged = np.sum(np.concatenate(cuttings_of(data)[0]) >= 0)
+    assert np.sqrt(held_out_squares(result, data).sum(axis=1) / judged) == pytest.approx(0.05, rel=0.08)
 
 
 def _fitted(errors, u=None, lag_s=0.0):
