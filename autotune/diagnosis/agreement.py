@@ -14,6 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from autotune.diagnosis.thresholds import IN_USE, Thresholds
 from autotune.recording import Recording
 
 #: Share of every recording that a part leaves out, at its beginning or at its end.
@@ -64,6 +65,7 @@ def agreement(
     parts: Sequence[Part],
     said: Callable[[Part], Mapping[str, float]],
     least: float = NAMED,
+    limits: Thresholds = IN_USE,
 ) -> Mapping[str, float]:
     """Return the effects that are likelier than not, with their probabilities.
 
@@ -78,13 +80,22 @@ def agreement(
     said : callable
         Returns the probabilities by a part, NaN of an effect that it cannot tell.
     least : float
-        Mean from which on an effect is returned.
+        Probability from which on an effect is returned.
+    limits : Thresholds
+        What decides between two findings.
 
     Returns
     -------
     mapping of str to float
-        The geometric mean over all rows and the parts that tell of an effect, where it is at least so much: what a part
-        contradicts is not named, however sure the others are.
+        The geometric mean over all rows and the parts that tell of an effect, with the odds that it would have had no
+        search been cooled, where it is at least so much: what a part contradicts is not named, however sure the others
+        are.
+
+    Notes
+    -----
+    One search is cooled, for its likelihood of these rows is too sure (``temperature``). Whether other rows say the
+    same is what the parts were asked: where they answered the odds count in full. That moves no probability across a
+    half, so that the same effects are named.
 
     References
     ----------
@@ -97,6 +108,7 @@ def agreement(
         all_said = [whole, *(one for part, one in heard if tells(part, begins.get(name, ())))]
         told = [max(p, LEAST) for p in (one.get(name, 0.0) for one in all_said) if not math.isnan(p)]
         mean = float(np.exp(np.mean(np.log(told))))
-        if mean >= least:
-            agreed[name] = mean
+        odds = (mean / (1.0 - mean)) ** (limits.temperature if len(told) > 1 else 1.0)
+        if (probability := min(odds / (1.0 + odds), limits.most_probable)) >= least:
+            agreed[name] = probability
     return agreed

@@ -95,7 +95,7 @@ def diagnose(
     if not begins:
         return _diagnosis(evidence.keeping(()), said=whole)
     parts = parts_of(recordings, LEAST_ROWS)
-    said = agreement(whole, begins, parts, _on_parts(evidence, progress), least=0.0)
+    said = agreement(whole, begins, parts, _on_parts(evidence, progress), 0.0, thresholds)
     evidence = evidence.keeping(likely(said))
     if judged(evidence) == "effect" and (unheeded := evidence.unheeded_commands()):
         return _diagnosis(evidence.keeping(()), unheeded)
