@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from autotune.api.shown import Cell, Row, html, rows_of
+from autotune.api.shown import Cell, Row, html, rows_of, text
 from autotune.diagnosis.result import Diagnosis
 
 
@@ -27,3 +27,6 @@ def _(result: Diagnosis) -> tuple[str, Row, list[Row]]:
 
 
 setattr(Diagnosis, "_repr_html_", html)  # noqa: B010 - the rooms below know nothing of notebooks
+# printed as it is, it would be all recordings, fits and thresholds
+setattr(Diagnosis, "__str__", text)  # noqa: B010 - see above
+setattr(Diagnosis, "__repr__", text)  # noqa: B010 - see above

@@ -126,7 +126,7 @@ def left_open(effects: Sequence[FoundEffect], evidence: Evidence, said: Mapping[
     """Return what is said of effects that are not named and that the recordings do not rule out."""
     named = {n for e in effects for n in (*counted_as(e.name) - {*kind_of(e.name).like}, *kind_of(e.name).includes)}
     able = {n: p for n, p in said.items() if n not in named and p >= 1.0 - evidence.limits.decided}
-    likeliest = sorted(able, key=lambda name: -able[name])[: evidence.limits.most_open]
+    likeliest = sorted(able, key=lambda name: -able[name])[: evidence.limits.leading]
     told = ", ".join(f"{name} ({able[name]:.2f})" for name in likeliest)
     return (f"Not ruled out, nor agreed on by parts of the recordings: {told}.",) if told else ()
 

@@ -84,7 +84,7 @@ def evidence_of(
         samples=samples,
         residual=residual_tests(retuned, data, uneven=any(kind_of(s.name).uneven for s in samples)),
         quality_of=cache(lambda: held_out(retuned, data)),
-        offset=None if unmoved(model, recordings) else offset_of(retuned, thresholds.off_sigmas),
+        offset=None if unmoved(model, recordings) else offset_of(retuned, thresholds.beyond_chance),
         evened=late is not None,
     )
     if found is None or (evidence.residual.uneven and evidence.residual.is_noise):
@@ -147,7 +147,7 @@ def _with_found(evidence: ChainEvidence, found: Found[JudgedChain], without: Seq
     offset = None
     if chosen.names and chosen.leaves_noise:
         residual = residual_tests(chosen.fit, under_noise(chosen.fit, chosen.data), uneven=residual.uneven)
-        offset = offset_of(chosen.fit, limits.off_sigmas)
+        offset = offset_of(chosen.fit, limits.beyond_chance)
     floor = noise_floor(near.retuned.fit, near.data)
     return replace(
         evidence, search=as_search(found), residual=residual, quality_of=lambda: quality(found, floor), offset=offset,

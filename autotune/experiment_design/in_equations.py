@@ -55,8 +55,8 @@ def _open(found: Diagnosis) -> dict[str, tuple[Outcome, float]]:
         name = "+".join(one.names) or "none"
         if name not in best or score(one) < score(best[name]):
             best[name] = one
-    alive = [c for c in found.candidates if c.name in best and c.probability >= limits.still_open]
-    return {c.name: (best[c.name].outcome, c.probability) for c in alive[: limits.most_open]}
+    alive = [c for c in found.candidates if c.name in best and c.probability >= limits.unknown_odds]
+    return {c.name: (best[c.name].outcome, c.probability) for c in alive[: limits.leading]}
 
 
 def _plan(found: Diagnosis, model: EquationModel) -> NextExperiment | None:

@@ -31,9 +31,9 @@ def open_hypotheses(found: Diagnosis) -> dict[str, tuple[Hypothesis, float]]:
     total = sum(p for _, _, p in classes.values()) or 1.0
     kept = classes[_class(least)][0]
     ranked = sorted(((label, h, p / total) for label, h, p in classes.values()), key=lambda c: -c[2])
-    few = [one for one in ranked if one[2] >= limits.still_open][: limits.most_open]
+    few = [one for one in ranked if one[2] >= limits.unknown_odds][: limits.leading]
     few += [one for one in ranked if one[0] == kept and one not in few]
-    return {label: (h, max(p, limits.still_open)) for label, h, p in few}
+    return {label: (h, max(p, limits.unknown_odds)) for label, h, p in few}
 
 
 def only_hypothesis(found: Diagnosis) -> str:

@@ -124,8 +124,8 @@ def _select(bench: Bench, fits: Sequence[Outcome], own: int) -> list[Outcome]:
         return quick_score(one, noise) - 2.0 * limits.temperature * float(odds)
 
     once = {frozenset(map(key_of, one.effects)): one for one in sorted(fits, key=charged, reverse=True)}
-    few = sorted(once.values(), key=charged)[: limits.rig_tried]
-    plain = [_fit_plainer(bench, one) for one in few[: limits.confirmed]]
+    few = sorted(once.values(), key=charged)[: limits.tried]
+    plain = [_fit_plainer(bench, one) for one in few[: limits.leading]]
     return [one for one in few if not is_plainer(one.effects[-1])] + [one for one in plain if one is not None]
 
 
@@ -168,8 +168,8 @@ def _fit_larger(
     found.sort(key=lambda one: quick_score(one, noise_of(small, there)))
     once = {(*key_of(one.effects[-1]), len(one.effects)): one for one in reversed(found)}
     carried: list[Outcome] = []
-    for one in sorted(once.values(), key=found.index)[: limits.confirmed]:
-        if np.log(there.rss / one.rss) < limits.equation_near * np.log(there.rss / found[0].rss):
+    for one in sorted(once.values(), key=found.index)[: limits.leading]:
+        if np.log(there.rss / one.rss) < limits.majority * np.log(there.rss / found[0].rss):
             continue
         progress(f"fitting {one.effects[-1].name} to all rows", 0.0)
         fits: list[Outcome | None] = []
@@ -203,7 +203,7 @@ def _fit_elsewhere(bench: Bench, one: Outcome) -> Outcome:
 
 
 def _is_near_noise(bench: Bench, one: Outcome) -> bool:
-    return is_noise(bench, one, bench.limits.equation_astray)
+    return is_noise(bench, one, bench.limits.clearly_more)
 
 
 def _fit_at_scales(
@@ -211,15 +211,14 @@ def _fit_at_scales(
 ) -> list[Outcome]:
     """Look at every effect at every place, and fit the best: on long windows, and from short ones where those fail."""
     limits = bench.limits
-    count = limits.equation_further if further else limits.equation_fitted
     beside = further and not _is_near_noise(bench, base)
-    found = _fit_best(bench, base, without, progress, count, beside)
+    found = _fit_best(bench, base, without, progress, limits.tried, beside)
     best = min(found, key=lambda one: one.rss, default=base)
     short = None if _is_near_noise(bench, best) else bench.shortened(base)
     if short is not None:
         # the base itself goes on as well: its effects may have been fitted in a wrong minimum
         again = [short] if further else []
-        found += _lengthen(bench, [*again, *_fit_best(bench, short, without, progress, count, beside)])
+        found += _lengthen(bench, [*again, *_fit_best(bench, short, without, progress, limits.tried, beside)])
     found.sort(key=lambda one: one.rss)
     for k, one in enumerate(found[:2]):
         if is_settled(bench, one, found[0]):
@@ -271,7 +270,7 @@ def _lengthen(bench: Bench, fits: Sequence[Outcome]) -> list[Outcome]:
     order = sorted(fits, key=lambda one: one.rss)
     usual = (one for one in order[CARRIED:] if len(one.effects) > 1 and is_usual(one.effects[-1]))
     for one in (*order[:CARRIED], *usual):
-        if found and is_settled(bench, one, order[0]) and is_noise(bench, found[0], bench.limits.adequate_quick):
+        if found and is_settled(bench, one, order[0]) and is_noise(bench, found[0], bench.limits.white):
             continue
         with suppress(InputError):
             found.append(bench.lengthened(one))

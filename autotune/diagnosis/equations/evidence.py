@@ -159,7 +159,7 @@ def residual_left(found: Found[JudgedEquations], samples: Sequence[SampleEffect]
     return ResidualTests(
         reduced_chi2=ratio, reduced_chi2_chance=math.sqrt(2.0 / chosen.residual.size), slow=slow, slow_chance=chance,
         uneven=any(kind_of(s.name).uneven for s in samples),
-        accounted=bool(samples) and ratio < found.best.limits.equation_astray, limits=found.best.limits,
+        accounted=bool(samples) and ratio < found.best.limits.clearly_more, limits=found.best.limits,
     )  # fmt: skip
 
 

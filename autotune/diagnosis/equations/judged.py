@@ -62,7 +62,7 @@ class JudgedEquations(Judged):
     def leaves_noise(self) -> bool:
         """Whether what it leaves is noise: no more variance, no slow part, and stretches are foretold about as well."""
         outcome, limits = self.outcome, self.limits
-        most = limits.adequate_quick + math.sqrt(2.0 / outcome.residual.size)
+        most = limits.white + math.sqrt(2.0 / outcome.residual.size)
         if not is_noise(self.bench, outcome, most) or is_slow(outcome, self.noise, limits):
             return False
         error = math.sqrt(total(self.long_squares) / outcome.residual.size)

@@ -54,9 +54,9 @@ def is_noise(bench: Bench, one: Outcome, most: float) -> bool:
 
 def is_settled(bench: Bench, one: Outcome, best: Outcome) -> bool:
     """Whether a fit need not be finished: another one of the same rows leaves noise alone, and it is far behind."""
-    if one is best or variance_ratio(best, noise_of(bench, best)) >= bench.limits.adequate_quick:
+    if one is best or variance_ratio(best, noise_of(bench, best)) >= bench.limits.white:
         return False
-    return one.residual.size * float(np.log(one.rss / max(best.rss, 1e-300))) > bench.limits.equation_behind
+    return one.residual.size * float(np.log(one.rss / max(best.rss, 1e-300))) > bench.limits.certain
 
 
 def is_slow(one: Outcome, noise: Noise, limits: Thresholds) -> bool:

@@ -57,9 +57,7 @@ def screen_effects(
         key = (*key_of(trial.effect), plainer(trial.effect) is None)
         if gain > 0.0 and (key not in best or gain > best[key][0]):
             best[key] = (gain, scale_trial(trial, factor), d)
-    ranked = sorted(_apart(best.values()), key=lambda pair: -pair[0])
-    least = bench.limits.equation_faint * ranked[0][0] if ranked else 0.0
-    return [pair for pair in ranked if pair[0] >= least]
+    return sorted(_apart(best.values()), key=lambda pair: -pair[0])
 
 
 def _apart(found: Iterable[tuple[float, Effect, FloatArray]]) -> list[tuple[float, Effect]]:

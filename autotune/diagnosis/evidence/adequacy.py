@@ -58,7 +58,7 @@ class ResidualTests:
     def allowed(self) -> float:
         """Largest reduced chi-square of noise: larger where it has no slow part, whose power over noise's is then 1."""
         limits = self.limits
-        return (limits.adequate_quick if self._is_white(1.0) else limits.adequate) + self.reduced_chi2_chance
+        return (limits.white if self._is_white(1.0) else limits.adequate) + self.reduced_chi2_chance
 
     @property
     def is_noise(self) -> bool:
@@ -161,6 +161,6 @@ def is_noise(result: Fit, data: Data) -> bool:
     """
     limits, slow, chance = data.thresholds, whiteness(result, data), 2.0 * _slow_chance(result)
     correlation = max(under_noise(result, data).noise.ar, default=0.0)
-    allowed = limits.adequate_quick if slow < 1.0 + chance else limits.adequate
+    allowed = limits.white if slow < 1.0 + chance else limits.adequate
     quiet = reduced_chi2(result, data) < allowed + math.sqrt(2.0 / result.rows)
     return quiet and slow < limits.white + chance and correlation < limits.slow_noise

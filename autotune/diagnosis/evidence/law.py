@@ -130,7 +130,7 @@ def law_effect(
     for r in recordings:
         stated = stated_law(r.metadata, controller)
         shown = None if stated is None else shown_law(r, stated, limits)
-        if shown is not None and np.max(shown.off) > limits.off_sigmas:
+        if shown is not None and np.max(shown.off) ** 2 > limits.beyond_chance:
             return SampleEffect(
                 name="controller.law",
                 equation=EQUATIONS[shown.parts],
@@ -210,7 +210,7 @@ def shown_law(r: Recording, stated: StatedLaw, limits: Thresholds = IN_USE) -> S
         ratio=found.gains / columns.aims,
         sd=found.sd / np.abs(columns.aims),
         recomputed=_stated_commands(best, r.u),
-        clear=not sought or best.left > limits.law_clearly_more * found.left,
+        clear=not sought or best.left > limits.clearly_more * found.left,
         filtered=not sought,
         least_change=limits.law_least_change,
     )

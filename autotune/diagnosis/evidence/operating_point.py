@@ -45,7 +45,7 @@ def _begins_with_a_step(model: Model, recording: Recording) -> bool:
     return at_rest and float(recording.u[0]) != model.input.offset
 
 
-def offset_of(result: Fit, sigmas: float = Thresholds.off_sigmas) -> Offset | None:
+def offset_of(result: Fit, beyond_chance: float = Thresholds.beyond_chance) -> Offset | None:
     """Return the operating point's shift where it is far outside its uncertainty.
 
     A shift may wander from window to window: its uncertainty is at least that of the windows' mean.
@@ -55,7 +55,7 @@ def offset_of(result: Fit, sigmas: float = Thresholds.off_sigmas) -> Offset | No
             variance = max(float(result.covariance[i, i]), 0.0)
             sd = math.sqrt(max(variance, _variance_of_mean(shifts_by_window(result, i)))) * free.size
             shift = result.theta[i] * free.size
-            if sd > 0.0 and abs(shift) > sigmas * sd and abs(shift) > 1e-3 * free.size:
+            if sd > 0.0 and shift**2 > beyond_chance * sd**2 and abs(shift) > 1e-3 * free.size:
                 return Offset(value=-shift, sd=sd)
     return None
 

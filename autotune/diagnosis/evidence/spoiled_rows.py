@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import TypeVar
@@ -43,7 +44,8 @@ def clear_samples(
     if not any(s.rows for s in seen):
         return seen
     run = retuned_rows(good)
-    return seen if run is None else [s for s in select_supported(seen, run) if s.speaks > limits.samples_clear]
+    clear = 2.0 * math.log(limits.decided / (1.0 - limits.decided))
+    return seen if run is None else [s for s in select_supported(seen, run) if s.speaks > clear]
 
 
 def search_beside(

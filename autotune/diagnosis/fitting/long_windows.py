@@ -52,7 +52,7 @@ def lengths_of(model: Model, recordings: Sequence[Recording], limits: Thresholds
         # as many windows as are always kept, of all rows that are fitted
         long = max(limits.long_window * slowest, limits.rig_rows / limits.least_windows * dt)
     long = min(long, duration)
-    short = min(max(limits.short_window * slowest, limits.least_short_rows * dt), long)
+    short = min(max(0.5 * limits.long_window * slowest, limits.least_window_rows * dt), long)
     return Lengths(short=long if long < 1.5 * short else short, long=long, swings=damping < limits.swinging)
 
 

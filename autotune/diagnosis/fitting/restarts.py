@@ -43,7 +43,7 @@ def renew_start_states(result: Fit, data: Data) -> Fit:
     """
     for _ in range(RENEWALS):
         again = fit_from(result.parametrisation, data, result.theta, states=30, iterations=30, rounds=4)
-        if again.cost > result.cost - data.thresholds.restart_decrease:
+        if again.cost > result.cost - data.thresholds.beyond_chance:
             break
         result = again
     return result
@@ -80,7 +80,7 @@ def realign_effects(result: Fit, data: Data) -> Fit:
     if best is before:
         return result
     again = fit(best.parametrisation, data, best.theta, result.x0, iterations=30, inherit=result)
-    return realign_effects(again, data) if again.cost < result.cost - data.thresholds.restart_decrease else result
+    return realign_effects(again, data) if again.cost < result.cost - data.thresholds.beyond_chance else result
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -20,11 +20,11 @@ def model_lag_s(model: Model) -> float:
 def known_from_s(model: Model, recording: Recording, thresholds: Thresholds = IN_USE) -> float:
     """Return the time from which on a recording's own commands tell what acts [s].
 
-    What was commanded before a recording begins is unknown: some of the slowest lags after the dead time it acts no
+    What was commanded before a recording begins is unknown: a slowest lag after the dead time it acts little
     more (through a dead time, a rate limit).
     """
     delay = sum(block.dynamics.delay_s for block in model.blocks)
-    unknown = delay + thresholds.unknown_lags * model_lag_s(model)
+    unknown = delay + model_lag_s(model)
     return float(recording.t[0] + min(unknown, thresholds.most_left_out * recording.duration_s))
 
 

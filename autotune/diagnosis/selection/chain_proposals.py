@@ -99,7 +99,7 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
             if base.leaves_noise:
                 found = [s for s in found if s.decrease > PROMISING * _charge(s)]
             found.sort(key=lambda s: -s.decrease - 2.0 * math.log(s.odds))
-            starts += [s for k, s in enumerate(found) if k < self.limits.rig_tried or s.odds >= PRIOR_ODDS["usual"]]
+            starts += [s for k, s in enumerate(found) if k < self.limits.tried or s.odds >= PRIOR_ODDS["usual"]]
         fits = self.pool.map(lambda s: _fit_added(s, self), starts)
         best: dict[frozenset[str], tuple[Fit, float, JudgedChain]] = {}
         for s, result in zip(starts, fits, strict=True):
@@ -109,7 +109,7 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
             if key not in best or result.cost < best[key][0].cost:
                 best[key] = result, log_odds, s.base
         order = sorted(best.values(), key=lambda one: one[0].cost - 2.0 * one[1])
-        able = [[one for one in order if one[2] is base][: self.limits.rig_tried] for base in beam]
+        able = [[one for one in order if one[2] is base][: self.limits.tried] for base in beam]
         done = self.pool.map(lambda one: self.judged(one[0], one[1]), [one for group in able for one in group])
         return [j for j in done if j is not None]
 
@@ -139,7 +139,7 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
 
     def finish_leading(self, found: Sequence[JudgedChain]) -> list[JudgedChain]:
         """Return the leading hypotheses fitted to the end, and what is larger fitted on from where the first one is."""
-        done = [j for j in self.pool.map(self.finished, leading(found, self.limits.rig_pruned)) if j is not None]
+        done = [j for j in self.pool.map(self.finished, leading(found, self.limits.leading)) if j is not None]
         return [*done, *_refit_larger([*found, *done], self)]
 
     def settle_numbers(self, best: JudgedChain, found: Sequence[JudgedChain]) -> JudgedChain:
@@ -190,7 +190,7 @@ def _refit_larger(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChai
     best = rank(found)[0]
     larger = [j for j in rank(found) if set(j.names) > set(best.names) and len(j.names) == len(best.names) + 1]
     once = {frozenset(j.names): j for j in reversed(larger)}
-    chosen = sorted(once.values(), key=larger.index)[: bench.limits.rig_pruned]
+    chosen = sorted(once.values(), key=larger.index)[: bench.limits.leading]
     return [j for j in bench.pool.map(lambda j: _fit_from_best(best, j, bench), chosen) if j is not None]
 
 
@@ -248,7 +248,7 @@ def _starts(base: JudgedChain, bench: Bench) -> list[_Start]:
     found = []
     for (kind, odds, near, data), group in zip(tried, effects, strict=True):
         order = sorted((p for _ in group for p in next(predicted)), key=lambda p: -p.decrease)
-        few = tuple(distinct_starts(order)[: bench.limits.rig_starts])
+        few = tuple(distinct_starts(order)[: bench.limits.followed])
         if few:
             found.append(
                 _Start(base=base, kind=kind, odds=odds, effects=few, near=near, data=data, decrease=order[0].decrease)

@@ -156,7 +156,7 @@ def _grow(at: Proposals[_J], progress: Progress) -> tuple[Proposals[_J], list[_J
         ranked = rank((best, *larger))
         leads = ranked[0] is not best
         ranked.remove(best)
-        beam = built_on(ranked, limits.rig_beam)
+        beam = built_on(ranked, limits.followed)
         if leads and ranked[0].is_better(best, limits.material):
             best = ranked[0]
             at = at.beside(best)
@@ -173,7 +173,7 @@ def _prune(at: Proposals[_J], found: Sequence[_J]) -> list[_J]:
     """
     result, done, limits = list(found), set[int](), found[0].limits
     for _ in range(limits.rig_effects):
-        fresh = [one for one in leading(result, limits.rig_pruned) if len(one.names) > 1 and id(one) not in done]
+        fresh = [one for one in leading(result, limits.leading) if len(one.names) > 1 and id(one) not in done]
         if not fresh:
             break
         done |= {id(one) for one in fresh}

@@ -246,4 +246,8 @@ def test_a_stated_control_law_reaches_the_diagnosis_of_equations(tmp_path):
     other = at.TransferFunction(num=(3.0 * gain,), den=(1.0,))
     assert "controller.law" in [e["name"] for e in at.diagnose(file, recording, other).as_json()["effects"]]
     same = at.diagnose(file, recording, at.TransferFunction(num=(gain,), den=(1.0,)))
+    for shown in (str(same), repr(same)):
+        assert shown.startswith("Verdict: ")
+        assert all(sentence in shown for sentence in same.sentences)
+        assert len(shown) < 3000
     assert same.verdict == "none"
