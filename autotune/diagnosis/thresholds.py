@@ -29,7 +29,8 @@ class Thresholds:
 
     # fmt: off
     # windows
-    least_window_rows: int = known(60, "rows", "shortest window", "convention")
+    lags_per_window: float = known(10.0, "slowest lags", "length of a window near the noise: long enough for structure to show", "cost")
+    least_window_rows: int = known(40, "rows", "shortest window", "convention")
     least_windows: int = known(6, "windows", "of a recording, where it has the rows; as many stay when data are thinned", "counted")
     most_left_out: float = known(0.03, "of a recording", "that is left out at its beginning at most", "convention")
     # noise
@@ -47,7 +48,7 @@ class Thresholds:
     prior_spread: float = known(0.2, "of the value", "sd of a nominal number: people's gains and lags are right to tens of percent", "convention")
     far_from_prior: float = known(1.5, "prior sd", "of a retuned number that may stand for something else: starts are found anew, and effects looked for beside the nominal numbers too", "convention")
     # predictions and screening
-    linear_share: float = known(0.3, "of chi2", "that an effect's direction may have before it is too large to be linear", "convention")
+    linear: float = known(0.3, "of a whole", "beyond which no derivative tells where to go: of chi2, by which an effect may move what is read; of its spread, by which a free run may err", "convention")
     searched_rows: int = known(30_000, "rows", "that a search works on at most; the best hypotheses are fitted to all", "cost")
     # adequacy
     adequate: float = known(1.04, "reduced chi2", "up to which a model is adequate, beside one sd of chance, and beyond which something is missing; clean ones leave 1.02", "counted")
@@ -61,7 +62,7 @@ class Thresholds:
     unknown_odds: float = known(0.03, "odds", "prior, of a cause outside the catalogue where the best explains the recordings; a hypothesis less probable is no longer open", "counted")
     most_probable: float = known(0.99, "probability", "stated at most", "convention")
     # rigs: where the model's error decides, stretches that were left out are what counts
-    long_window: float = known(8.0, "slowest times, or periods", "length of windows of a plant that integrates or rings, and of all near the noise; short ones are half as long", "convention")
+    long_window: float = known(8.0, "slowest times, or periods", "length of windows of a plant that integrates or rings; short ones are half as long", "convention")
     ringing: float = known(0.05, "damping", "below which long windows are some periods", "convention")
     swinging: float = known(0.5, "damping", "below which a fit goes from short to long windows", "convention")
     rig_rows: int = known(9000, "rows", "fitted at most", "cost")
@@ -72,7 +73,6 @@ class Thresholds:
     followed: int = known(2, "of a ranking", "that are followed: hypotheses that are built on, starting points of an effect that are fitted", "cost")
     leading: int = known(4, "hypotheses", "leading: each effect of them is left out once more, they are fitted to all rows where a search worked on some, and an experiment is planned between them", "cost")
     tried: int = known(8, "effects", "beside one hypothesis that are fitted, and of the fits those that are judged on left-out stretches", "cost")
-    out_of_phase: float = known(0.3, "of the spread", "held-out error from which on a free run may be out of phase", "convention")
     # equations: any model, judged as it runs freely through windows of a third of a recording
     clearly_more: float = known(2.0, "times", "variance that is clearly more: than the noise, so that fits begin anew from short windows; than another law leaves", "counted")
     certain: float = known(400.0, "chi2", "above which more says nothing more: of a fit behind one that leaves noise, of what an experiment may tell", "cost")

@@ -226,7 +226,7 @@ def _rate_excitation(
 ) -> tuple[Plan, FloatArray]:
     """Return an excitation with its expected discrimination, and all readings that the hypotheses predict."""
     model, limits = found.search.retuned.fit.model, found.search.data.thresholds
-    starts, stops = window_rows(planned, limits.long_window * model_lag_s(model), float(planned.t[0]), limits)
+    starts, stops = window_rows(planned, limits.lags_per_window * model_lag_s(model), float(planned.t[0]), limits)
     data = Data(
         recordings=(planned,), good=(np.ones(len(planned), dtype=bool),), starts=(starts,), stops=(stops,),
         noise=found.search.data.noise, thresholds=limits, numbers=(len(found.search.data.recordings),),

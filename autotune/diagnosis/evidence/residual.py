@@ -149,9 +149,8 @@ class FreedResidual:
 
     def explained(self, error: float, before: float) -> float:
         """Return the share of the held-out residual above the noise that is gone."""
-        return float(
-            np.clip((before - error) / max(before - self.floor, self.data.thresholds.material * self.floor), 0.0, 1.0)
-        )
+        above = max(before - self.floor, self.data.thresholds.material * self.floor)
+        return float(np.clip((before - error) / above, 0.0, 1.0)) if above > 0.0 else 0.0
 
 
 def filled(signals: FloatArray) -> FloatArray:

@@ -18,6 +18,8 @@ from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit, states_of
 from autotune.diagnosis.fitting.long_windows import lengths_of
 
+#: Share of a stretch that tells its start state, where it is one run: nothing else does.
+HEAD = 0.12
 #: Share of the longest recording that is left out, and rows of it at most: a picture shows no more.
 SHARE, MOST_ROWS = 4, 20_000
 #: Share of the spread in the liveliest stretch below which the last one is passed over: little would be told there.
@@ -153,7 +155,7 @@ def _heads(data: Data, number: int, first: int, last: int, retuned: Fit) -> Data
     edges = np.linspace(first, last, count + 1).round().astype(np.int64)
     told = np.zeros(ok.size, dtype=bool)
     for a, b in pairwise(edges):
-        told[a : a + max(LEAST_HEAD, int(LARGE_HEAD * (b - a)) if count > 1 else 0)] = True
+        told[a : a + max(LEAST_HEAD, int((HEAD if count == 1 else LARGE_HEAD) * (b - a)))] = True
     return replace(
         data,
         recordings=(r,),

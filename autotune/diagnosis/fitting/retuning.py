@@ -58,7 +58,7 @@ def prepare(
     data, retuned
         Data with windows and noise, and the fit. Of long recordings windows are left out evenly.
     """
-    length = thresholds.long_window * model_lag_s(model)
+    length = thresholds.lags_per_window * model_lag_s(model)
     noise = floor_noise(noise_from_differences([r.y for r in recordings], good), recordings)
     windows = [window_rows(r, length, known_from_s(model, r, thresholds), thresholds) for r in recordings]
     data = Data(

@@ -231,7 +231,7 @@ def _starts(base: JudgedChain, bench: Bench) -> list[_Start]:
     Where the free run through long windows is out of phase, no derivative there leads anywhere: short ones do.
     """
     scales = [(base.fit, bench.long)]
-    if bench.has_shorter and base.error > bench.limits.out_of_phase:
+    if bench.has_shorter and base.error > bench.limits.linear:
         with suppress(*RUNAWAY):
             scales.append((bench.shortened(base.fit), bench.few))
     taken = related_effects(base.names)

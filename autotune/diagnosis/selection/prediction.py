@@ -128,7 +128,7 @@ def predictions(base: Fit, effect: Effect, data: Data) -> list[Prediction]:
     An effect that moves the reading by more than a share of chi2 is shrunk: what far too large an effect does
     tells nothing of its direction near zero. Dry friction that is as large as that is found from its own size alone.
     """
-    tried, linear = [], data.thresholds.linear_share
+    tried, linear = [], data.thresholds.linear
     for _ in range(SHRINKINGS):
         found, share = _predicted(base, effect, data)
         tried.append(found)

@@ -70,18 +70,12 @@ class TestStretchesWithCommandsThatStandStill:
         assert share_of(answering(np.ones(ROWS)), 1.0) is None
 
 
-@pytest.mark.parametrize("seed", [3, 6])
+@pytest.mark.parametrize("seed", [3, 6, 15])
 def test_nothing_is_said_of_two_walks(seed: int) -> None:
     result = diagnose(NOMINAL, [surrogate("random walk", seed)])
     assert (result.verdict, result.effects, result.candidates) == ("unexplained", (), ())
     assert result.sentences[0].startswith("Nothing is said of what is missing")
     assert (result.extended_model.blocks, result.extended_model.effects) == (NOMINAL.blocks, ())
-
-
-def test_a_walk_that_no_model_follows_bears_nothing_out() -> None:
-    result = diagnose(NOMINAL, [surrogate("random walk", 15)])
-    assert (result.effects, result.extended_model.effects) == ((), ())
-    assert result.sentences[0].startswith("Nothing contradicts the simulation, and nothing bears it out")
 
 
 def test_nothing_is_said_of_a_plant_that_its_controller_alone_moves() -> None:
