@@ -12,7 +12,7 @@ import numpy as np
 from autotune.controller import Controller
 from autotune.diagnosis.agreement import Part, agreement, likely, parts_of
 from autotune.diagnosis.equations.gathering_equations import evidence_of_equations
-from autotune.diagnosis.findings import consistent, found_effects, places_of, said_by, sentences_of
+from autotune.diagnosis.findings import alike, consistent, found_effects, places_of, said_by, sentences_of
 from autotune.diagnosis.gathering import evidence_of
 from autotune.diagnosis.result import Diagnosis, FoundEffect
 from autotune.diagnosis.selection.probability import share_of
@@ -109,7 +109,8 @@ def _diagnosis(
     verdict = "unexplained" if instead else judged(evidence)
     named = [e for e in found_effects(evidence, verdict) if e.name in kept]
     own = {name: p * share_of(name, evidence.candidates) for name, p in said.items()}
-    effects = tuple(replace(e, probability=own[e.name]) for e in named)
+    ruled_out = 1.0 - evidence.limits.decided
+    effects = tuple(replace(e, probability=own[e.name], alike=alike(e.name, own, ruled_out)) for e in named)
     description = evidence.description() if verdict == "unexplained" and not instead else None
     places = () if instead else places_of(evidence, effects, description)
     handed_out, wanted = evidence.handed_out("none" if instead else verdict)

@@ -54,6 +54,30 @@ def _of_samples(s: SampleEffect, evidence: Evidence) -> FoundEffect:
     )
 
 
+def alike(name: str, said: Mapping[str, float], least: float) -> dict[str, float]:
+    """Return the effects that do nearly the same as one and are not ruled out, with their probabilities.
+
+    Parameters
+    ----------
+    name : str
+        The effect.
+    said : mapping of str to float
+        Probabilities of all effects, each with its own share of those like it.
+    least : float
+        Probability below which an effect is ruled out.
+
+    Returns
+    -------
+    dict of str to float
+        What command and reading cannot tell apart at all stands there once.
+    """
+    found: dict[str, float] = {}
+    for other in kind_of(name).like:
+        if said.get(other, 0.0) >= least and not found.keys() & set(kind_of(other).same):
+            found[other] = said[other]
+    return found
+
+
 def consistent(
     candidates: Sequence[Candidate], effects: Mapping[str, float], chosen: Sequence[str]
 ) -> tuple[Candidate, ...]:
@@ -147,9 +171,8 @@ def sentences_of(
     said : mapping of str to float, optional
         Probabilities of all effects, those that are not named too; what all rows say by default.
     """
-    said = said_by(evidence) if said is None else said
-    possible = left_open(effects, evidence, said)
-    sentences = [_first(verdict, effects, evidence, places, said, open_=bool(possible)), *possible]
+    possible = left_open(effects, evidence, said_by(evidence) if said is None else said)
+    sentences = [_first(verdict, effects, evidence, places, open_=bool(possible)), *possible]
     if evidence.own_noise:
         sentences.append(evidence.own_noise)
     elif not evidence.residual.is_constant:
@@ -164,29 +187,8 @@ def sentences_of(
     )
 
 
-def effect_in_words(e: FoundEffect, said: Mapping[str, float], least: float) -> str:
-    """Return an effect with its probability, and with that of effects like it which are not ruled out beside it.
-
-    Parameters
-    ----------
-    e : FoundEffect
-        What is named.
-    said : mapping of str to float
-        Probabilities of all effects, each with its own share of those like it.
-    least : float
-        Probability below which an effect is ruled out.
-    """
-    alike = sorted(name for name in kind_of(e.name).like if said.get(name, 0.0) >= least)
-    # what cannot be told apart at all has its probability once
-    apart = [name for i, name in enumerate(alike) if not set(kind_of(name).same) & set(alike[:i])]
-    together = e.probability + sum(said[name] for name in apart)
-    beside_it = f"; {together:.2f} with {' or '.join(alike)}, which does nearly the same" if alike else ""
-    return f"{e.name}{f' at {e.at}' if e.at else ''} (probability {e.probability:.2f}{beside_it})"
-
-
 def _first(
-    verdict: Verdict, effects: Sequence[FoundEffect], evidence: Evidence, places: Sequence[str],
-    said: Mapping[str, float], *, open_: bool,
+    verdict: Verdict, effects: Sequence[FoundEffect], evidence: Evidence, places: Sequence[str], *, open_: bool
 ) -> str:  # fmt: skip
     match verdict:
         case "none" if not evidence.follows:
@@ -201,7 +203,7 @@ def _first(
                 "The numbers are not right: retuned, the simulation is nearer to the recordings, but not down to noise."
             )
         case "effect":
-            names = " and ".join(effect_in_words(e, said, 1.0 - evidence.limits.decided) for e in effects)
+            names = " and ".join(f"{e.name}{f' at {e.at}' if e.at else ''} ({e.in_odds})" for e in effects)
             rest = "" if evidence.is_clean else " What is left is not noise: something else is missing as well."
             return f"Physics was left out: {names}.{beside(effects, evidence)}{rest}"
         case _ if not evidence.follows:

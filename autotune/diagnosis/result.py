@@ -59,6 +59,8 @@ class FoundEffect:
         Where it acts in equations, and the recorded column that it is of.
     as_command : mapping of str to Parameter
         Its sizes as the steady command that does the same: one unit for a chain and for equations.
+    alike : mapping of str to float
+        Probabilities of effects that do nearly the same and are not ruled out beside it.
     """
 
     name: str
@@ -73,6 +75,20 @@ class FoundEffect:
     input: str = ""
     column: str = ""
     as_command: Mapping[str, Parameter] = field(default_factory=dict)
+    alike: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def together(self) -> float:
+        """Probability that it, or one of those that do nearly the same, is part of the truth."""
+        return self.probability + sum(self.alike.values())
+
+    @property
+    def in_odds(self) -> str:
+        """Its probability in words, and that of it together with those that do nearly the same."""
+        beside = (
+            f"; {self.together:.2f} with {' or '.join(self.alike)}, which does nearly the same" if self.alike else ""
+        )
+        return f"probability {self.probability:.2f}{beside}"
 
     @property
     def at(self) -> str:

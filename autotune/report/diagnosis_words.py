@@ -24,7 +24,7 @@ def verdict_of(found: Diagnosis) -> str:
     """Return the verdict in a sentence, effects in words with their names in brackets."""
     if found.verdict != "effect" or not found.effects:
         return found.sentences[0]
-    said = join_clauses([f"{clause(e.name)} ({_name_of(e)}, probability {e.probability:.2f})" for e in found.effects])
+    said = join_clauses([f"{clause(e.name)} ({_name_of(e)}, {e.in_odds})" for e in found.effects])
     rest = "" if found.is_clean else " Something smaller is missing as well: what is left is not noise."
     return f"The model leaves physics out: {said}.{rest}"
 
@@ -79,7 +79,8 @@ def _finding_text(found: Diagnosis) -> str:
 
 def _sure(found: Diagnosis) -> str:
     said = [
-        f"{in_short(e.name).capitalize()}: {_word(e.probability)} ({100 * e.probability:.0f} in 100)."
+        f"{' or '.join([in_short(e.name).capitalize(), *map(in_short, e.alike)])}: {_word(e.together)}"
+        f" ({100 * e.together:.0f} in 100{f', {100 * e.probability:.0f} for the first' if e.alike else ''})."
         for e in found.effects
     ]
     if found.verdict == "none":
