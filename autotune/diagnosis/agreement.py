@@ -87,15 +87,14 @@ def agreement(
     Returns
     -------
     mapping of str to float
-        The geometric mean over all rows and the parts that tell of an effect, with the odds that it would have had no
-        search been cooled, where it is at least so much: what a part contradicts is not named, however sure the others
-        are.
+        The geometric mean over all rows and the parts that tell of an effect, where it is at least so much: what a part
+        contradicts is not named, however sure the others are. What they confirm has its odds in full.
 
     Notes
     -----
     One search is cooled, for its likelihood of these rows is too sure (``temperature``). Whether other rows say the
-    same is what the parts were asked: where they answered the odds count in full. That moves no probability across a
-    half, so that the same effects are named.
+    same is what the parts were asked: what is likelier than not by all of them is stated with its odds in full, so that
+    the same effects are named. What they do not confirm stays as open as it was.
 
     References
     ----------
@@ -108,7 +107,24 @@ def agreement(
         all_said = [whole, *(one for part, one in heard if tells(part, begins.get(name, ())))]
         told = [max(p, LEAST) for p in (one.get(name, 0.0) for one in all_said) if not math.isnan(p)]
         mean = float(np.exp(np.mean(np.log(told))))
-        odds = (mean / (1.0 - mean)) ** (limits.temperature if len(told) > 1 else 1.0)
-        if (probability := min(odds / (1.0 + odds), limits.most_probable)) >= least:
+        probability = warmed(mean, limits) if mean >= NAMED and len(told) > 1 else mean
+        if probability >= least:
             agreed[name] = probability
     return agreed
+
+
+def warmed(probability: float, limits: Thresholds) -> float:
+    """Return a probability with the odds that it would have had no search been cooled, outside causes allowed for.
+
+    Parameters
+    ----------
+    probability : float
+        As a search states it.
+    limits : Thresholds
+        How far a search is cooled, and the prior odds of a cause outside the catalogue.
+    """
+    most = 1.0 / (1.0 + limits.unknown_odds)
+    if probability >= most:
+        return probability
+    odds = (probability / (1.0 - probability)) ** limits.temperature
+    return float(min(odds / (1.0 + odds), most))

@@ -156,7 +156,7 @@ class ChainEvidence(Evidence):
         kind, parameters = kind_of(effect.name), readable(effect)
         return FoundEffect(
             name=effect.name,
-            probability=probability_of(effect.name, self.candidates, self.limits.most_probable),
+            probability=probability_of(effect.name, self.candidates),
             places=self.places(effect.name),
             parameters=MappingProxyType(parameters),
             equation=kind.equation,

@@ -32,7 +32,7 @@ def found_effects(evidence: Evidence, verdict: Verdict) -> tuple[FoundEffect, ..
 
 def said_by(evidence: Evidence) -> dict[str, float]:
     """Return the probabilities of all effects that are in a hypothesis, and of those that samples show."""
-    most, candidates = evidence.limits.most_probable, evidence.candidates
+    candidates = evidence.candidates
     names = {name for c in candidates for name in c.name.split("+") if name in KINDS}
     names |= {smaller for name in names for smaller in KINDS[name].includes}
     allowed = names - evidence.contradicted - STRUCTURES.keys()
@@ -40,7 +40,7 @@ def said_by(evidence: Evidence) -> dict[str, float]:
     if evidence.offset is not None and judged(evidence) == "effect":
         shown |= {e.name: e.probability for _, e in evidence.described() if e.name not in allowed}
     # rows that leave too much open for a verdict still weigh what it may be
-    return {name: probability_of(name, candidates, most) for name in sorted(allowed)} | shown
+    return {name: probability_of(name, candidates) for name in sorted(allowed)} | shown
 
 
 def _of_samples(s: SampleEffect, evidence: Evidence) -> FoundEffect:

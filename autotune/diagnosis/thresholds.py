@@ -60,7 +60,6 @@ class Thresholds:
     # verdict and probabilities
     temperature: float = known(2.0, "chi2", "that counts as one: neither noise nor a model's error is ever ideal", "counted")
     unknown_odds: float = known(0.03, "odds", "prior, of a cause outside the catalogue where the best explains the recordings; a hypothesis less probable is no longer open", "counted")
-    most_probable: float = known(0.99, "probability", "stated at most", "convention")
     # rigs: where the model's error decides, stretches that were left out are what counts
     long_window: float = known(8.0, "slowest times, or periods", "length of windows of a plant that integrates or rings; short ones are half as long", "convention")
     ringing: float = known(0.05, "damping", "below which long windows are some periods", "convention")

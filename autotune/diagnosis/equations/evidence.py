@@ -97,7 +97,7 @@ class EquationEvidence(Evidence):
         command, unit = command_of(bench, chosen, effect), bench.model.inputs[0]
         return FoundEffect(
             name=effect.name,
-            probability=probability_of(effect.name, self.candidates, self.limits.most_probable),
+            probability=probability_of(effect.name, self.candidates),
             places=self.places(effect.name),
             parameters=MappingProxyType(shown),
             equation=equation_of(bench.model, effect),

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 
-from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import KINDS, counted_as
 
 
@@ -38,9 +37,9 @@ def weighed(scores: Mapping[str, float], scale: float, unknown_odds: float) -> t
     return tuple(Candidate(name=name, probability=w / total) for name, w in ranked if w / total > 1e-4)[:12]
 
 
-def probability_of(name: str, candidates: Sequence[Candidate], most: float = Thresholds.most_probable) -> float:
+def probability_of(name: str, candidates: Sequence[Candidate]) -> float:
     """Return the probability that an effect is part of the truth: as such, in a larger one, or as one like it."""
-    return min(_sum_of(counted_as(name), candidates), most)
+    return _sum_of(counted_as(name), candidates)
 
 
 def share_of(name: str, candidates: Sequence[Candidate]) -> float:
