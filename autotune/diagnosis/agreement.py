@@ -107,13 +107,13 @@ def agreement(
         all_said = [whole, *(one for part, one in heard if tells(part, begins.get(name, ())))]
         told = [max(p, LEAST) for p in (one.get(name, 0.0) for one in all_said) if not math.isnan(p)]
         mean = float(np.exp(np.mean(np.log(told))))
-        probability = warmed(mean, limits) if mean >= NAMED and len(told) > 1 else mean
+        probability = undo_cooling(mean, limits) if mean >= NAMED and len(told) > 1 else mean
         if probability >= least:
             agreed[name] = probability
     return agreed
 
 
-def warmed(probability: float, limits: Thresholds) -> float:
+def undo_cooling(probability: float, limits: Thresholds) -> float:
     """Return a probability with the odds that it would have had no search been cooled, outside causes allowed for.
 
     Parameters

@@ -109,8 +109,14 @@ def _diagnosis(
     verdict = "unexplained" if instead else judged(evidence)
     named = [e for e in found_effects(evidence, verdict) if e.name in kept]
     own = {name: p * share_of(name, evidence.candidates) for name, p in said.items()}
-    ruled_out = 1.0 - evidence.limits.decided
-    effects = tuple(replace(e, probability=own[e.name], alike=alike(e.name, own, ruled_out)) for e in named)
+    others, ruled_out = (
+        {n: p for n, p in own.items() if n not in {e.name for e in named}},
+        1.0 - evidence.limits.decided,
+    )
+    effects = tuple(
+        replace(e, probability=own[e.name], alike=alike(e.name, others, ruled_out), together=said[e.name])
+        for e in named
+    )
     description = evidence.description() if verdict == "unexplained" and not instead else None
     places = () if instead else places_of(evidence, effects, description)
     handed_out, wanted = evidence.handed_out("none" if instead else verdict)

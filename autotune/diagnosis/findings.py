@@ -54,8 +54,8 @@ def _of_samples(s: SampleEffect, evidence: Evidence) -> FoundEffect:
     )
 
 
-def alike(name: str, said: Mapping[str, float], least: float) -> dict[str, float]:
-    """Return the effects that do nearly the same as one and are not ruled out, with their probabilities.
+def alike(name: str, said: Mapping[str, float], least: float) -> tuple[str, ...]:
+    """Return the effects that do nearly the same as one and are not ruled out.
 
     Parameters
     ----------
@@ -68,14 +68,14 @@ def alike(name: str, said: Mapping[str, float], least: float) -> dict[str, float
 
     Returns
     -------
-    dict of str to float
+    tuple of str
         What command and reading cannot tell apart at all stands there once.
     """
-    found: dict[str, float] = {}
+    found: list[str] = []
     for other in kind_of(name).like:
-        if said.get(other, 0.0) >= least and not found.keys() & set(kind_of(other).same):
-            found[other] = said[other]
-    return found
+        if said.get(other, 0.0) >= least and not set(found) & set(kind_of(other).same):
+            found.append(other)
+    return tuple(found)
 
 
 def consistent(

@@ -59,8 +59,10 @@ class FoundEffect:
         Where it acts in equations, and the recorded column that it is of.
     as_command : mapping of str to Parameter
         Its sizes as the steady command that does the same: one unit for a chain and for equations.
-    alike : mapping of str to float
-        Probabilities of effects that do nearly the same and are not ruled out beside it.
+    alike : tuple of str
+        Effects that do nearly the same and are not ruled out beside it.
+    together : float
+        Where there are any: that it, or one of them, is part of the truth.
     """
 
     name: str
@@ -75,12 +77,8 @@ class FoundEffect:
     input: str = ""
     column: str = ""
     as_command: Mapping[str, Parameter] = field(default_factory=dict)
-    alike: Mapping[str, float] = field(default_factory=dict)
-
-    @property
-    def together(self) -> float:
-        """Probability that it, or one of those that do nearly the same, is part of the truth."""
-        return self.probability + sum(self.alike.values())
+    alike: tuple[str, ...] = ()
+    together: float = 0.0
 
     @property
     def in_odds(self) -> str:

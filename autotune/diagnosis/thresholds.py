@@ -72,7 +72,6 @@ class Thresholds:
     followed: int = known(2, "of a ranking", "that are followed: hypotheses that are built on, starting points of an effect that are fitted", "cost")
     leading: int = known(4, "hypotheses", "leading: each effect of them is left out once more, they are fitted to all rows where a search worked on some, and an experiment is planned between them", "cost")
     tried: int = known(8, "effects", "beside one hypothesis that are fitted, and of the fits those that are judged on left-out stretches", "cost")
-    # equations: any model, judged as it runs freely through windows of a third of a recording
     clearly_more: float = known(2.0, "times", "variance that is clearly more: than the noise, so that fits begin anew from short windows; than another law leaves", "counted")
     certain: float = known(400.0, "chi2", "above which more says nothing more: of a fit behind one that leaves noise, of what an experiment may tell", "cost")
     equation_rows: int = known(2000, "rows", "that a search works on; the leading effects are fitted to all", "cost")

@@ -79,9 +79,10 @@ def _finding_text(found: Diagnosis) -> str:
 
 def _sure(found: Diagnosis) -> str:
     said = [
-        f"{' or '.join([in_short(e.name).capitalize(), *map(in_short, e.alike)])}: {_word(e.together)}"
-        f" ({100 * e.together:.0f} in 100{f', {100 * e.probability:.0f} for the first' if e.alike else ''})."
+        f"{' or '.join([in_short(e.name).capitalize(), *map(in_short, e.alike)])}: {_word(p)}"
+        f" ({100 * p:.0f} in 100{f', {100 * e.probability:.0f} for the first' if e.alike else ''})."
         for e in found.effects
+        for p in [e.together if e.alike else e.probability]
     ]
     if found.verdict == "none":
         p = next((c.probability for c in found.candidates if c.name == "none"), math.nan)

@@ -43,18 +43,11 @@ def cuttings_in(
     """Return the same from the readings of each recording and its windows: first rows, and rows before which they end.
 
     Where windows are many a stretch is some of them. Else the rows are cut twice: into stretches of as many rows each,
-    and into those that tell as much each, see :func:`told_by`.
+    and into those that tell as much each, see :func:`weights_of_rows`.
     """
-    windows = sum(len(a) for a in firsts)
-    share = LARGE_HEAD if windows >= STRETCHES else 0.0
-    judged = []
-    for y, starts, stops in zip(readings, firsts, ends, strict=True):
-        rows = np.zeros(y.size, dtype=bool)
-        for a, b in zip(starts, stops, strict=True):
-            rows[a + max(LEAST_HEAD, int(share * (b - a))) : b] = True
-        judged.append(rows)
+    windows, judged = sum(len(a) for a in firsts), _beyond_heads([y.size for y in readings], firsts, ends)
     if windows < STRETCHES:
-        return [_cut(judged, [np.ones(y.size) for y in readings]), _cut(judged, [told_by(y) for y in readings])]
+        return [_cut(judged, [np.ones(y.size) for y in readings]), _cut(judged, [weights_of_rows(y) for y in readings])]
     number, labels = 0, []
     for rows, starts, stops in zip(judged, firsts, ends, strict=True):
         label = np.full(rows.size, -1, dtype=np.int64)
@@ -63,6 +56,17 @@ def cuttings_in(
             number += 1
         labels.append(label)
     return [labels]
+
+
+def _beyond_heads(rows: Sequence[int], firsts: Sequence[IntArray], ends: Sequence[IntArray]) -> list[BoolArray]:
+    """Return which rows are judged, per recording: those of each window behind its head."""
+    share, judged = LARGE_HEAD if sum(len(a) for a in firsts) >= STRETCHES else 0.0, []
+    for count, starts, stops in zip(rows, firsts, ends, strict=True):
+        mask = np.zeros(count, dtype=bool)
+        for a, b in zip(starts, stops, strict=True):
+            mask[a + max(LEAST_HEAD, int(share * (b - a))) : b] = True
+        judged.append(mask)
+    return judged
 
 
 def _cut(judged: Sequence[BoolArray], weights: Sequence[FloatArray]) -> list[IntArray]:
@@ -78,7 +82,7 @@ def _cut(judged: Sequence[BoolArray], weights: Sequence[FloatArray]) -> list[Int
     return labels
 
 
-def told_by(y: FloatArray) -> FloatArray:
+def weights_of_rows(y: FloatArray) -> FloatArray:
     """Return how much each row of a recording tells, in rows: half as a row, half by how fast y moves there.
 
     Parameters
@@ -237,5 +241,5 @@ def rms(residuals: Sequence[FloatArray], good: Sequence[BoolArray]) -> float:
 
 def judged_rows(data: Data) -> int:
     """Return how many rows are judged: as many whichever way they are cut."""
-    pairs = zip(cuttings_of(data)[0], data.good, strict=True)
-    return max(1, sum(int(((label >= 0) & good).sum()) for label, good in pairs))
+    judged = _beyond_heads([len(r) for r in data.recordings], data.starts, data.stops)
+    return max(1, sum(int((mask & good).sum()) for mask, good in zip(judged, data.good, strict=True)))

@@ -135,7 +135,9 @@ def test_a_lag_is_named_with_all_the_places_it_may_sit(shared: Path) -> None:
     case = shared / "practice_cases" / "case_009"
     recordings = [read_recording(case / f"rec{k}.csv") for k in (1, 2)]
     found = with_next_experiment(diagnose(read_model(case / "model.toml"), recordings))
-    assert found.effects[0].name in ("actuator.lag", "sensor.lag")
+    lag = found.effects[0]
+    assert lag.name in ("actuator.lag", "sensor.lag")
+    assert lag.probability - 1e-9 <= lag.together <= 1.0
     assert {"actuator", "sensor"} <= set(found.places)
     assert found.next_experiment is not None
 

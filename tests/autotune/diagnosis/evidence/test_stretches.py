@@ -13,7 +13,7 @@ from autotune.diagnosis.evidence.stretches import (
     correlation_rows,
     cuttings_of,
     held_out_squares,
-    told_by,
+    weights_of_rows,
 )
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.long_windows import cut
@@ -54,21 +54,21 @@ def test_the_head_of_every_window_is_never_judged_and_all_stretches_are():
 @given(size=st.floats(1e-6, 1e6), shift=st.floats(-1e3, 1e3))
 def test_what_rows_tell_does_not_hang_on_units(size: float, shift: float):
     y = np.random.default_rng(0).normal(size=500).cumsum()
-    assert told_by(size * (y + shift)) == pytest.approx(told_by(y), rel=1e-6)
+    assert weights_of_rows(size * (y + shift)) == pytest.approx(weights_of_rows(y), rel=1e-6)
 
 
 def test_rows_tell_as_much_as_each_other_where_y_moves_evenly_or_is_noise():
     noise = np.random.default_rng(0).normal(size=8000)
-    assert told_by(3.0 * np.arange(1000.0)) == pytest.approx(1.0)
-    assert told_by(np.full(1000, 2.0)) == pytest.approx(1.0)
-    assert told_by(noise).reshape(8, -1).mean(axis=1) == pytest.approx(1.0, abs=0.1)
+    assert weights_of_rows(3.0 * np.arange(1000.0)) == pytest.approx(1.0)
+    assert weights_of_rows(np.full(1000, 2.0)) == pytest.approx(1.0)
+    assert weights_of_rows(noise).reshape(8, -1).mean(axis=1) == pytest.approx(1.0, abs=0.1)
 
 
 def test_gaps_in_the_readings_tell_what_lies_around_them():
     y = np.cumsum(np.random.default_rng(0).normal(size=1000))
     gaps = np.where(np.arange(1000) % 7 == 3, np.nan, y)
-    assert told_by(gaps).mean() == pytest.approx(1.0)
-    assert told_by(np.full(100, np.nan)) == pytest.approx(1.0)
+    assert weights_of_rows(gaps).mean() == pytest.approx(1.0)
+    assert weights_of_rows(np.full(100, np.nan)) == pytest.approx(1.0)
 
 
 def test_a_step_response_in_a_long_record_has_more_than_one_witness():

@@ -101,6 +101,13 @@ def test_that_y_comes_later_is_likely_though_neither_lag_nor_dead_time_is() -> N
     assert share_of(CURVED, candidates) == 1.0
 
 
+def test_shares_of_a_lag_and_a_dead_time_that_are_both_there_add_up_to_more_than_they_have_together() -> None:
+    both = hypothesis_of((LAG, DEAD), 0.3)
+    candidates = probabilities([hypothesis_of((), 1.0), hypothesis_of((LAG,), 0.9), both], both, 0.03)
+    assert share_of(LAG, candidates) + share_of(DEAD, candidates) > 1.5
+    assert probability_of(LAG, candidates) == probability_of(DEAD, candidates) < 1.0
+
+
 def test_what_predicts_best_is_built_on_though_it_is_too_rare_to_lead() -> None:
     usual = [hypothesis_of((name,), size) for name, size in ((DRY, 0.8), (CURVED, 0.85), (LAG, 0.9))]
     rare = hypothesis_of((GRAVITY,), 0.7, math.log(1e-4))
