@@ -544,13 +544,8 @@ def write_recording(recording: Recording, path: str | os.PathLike[str]) -> None:
     """
     path = Path(path)
     columns = {"t": recording.t, "u": recording.u, "y": recording.y, **recording.extra}
-    np.savetxt(
-        path,
-        np.column_stack(list(columns.values())),
-        fmt="%.12g",
-        delimiter=",",
-        header=",".join(columns),
-        comments="",
-    )
+    rows, text = np.column_stack(list(columns.values())), io.StringIO()
+    np.savetxt(text, rows, fmt="%.12g", delimiter=",", header=",".join(columns), comments="")
+    write_whole(path, text.getvalue())
     if recording.metadata:
         write_whole(path.with_suffix(".toml"), tomli_w.dumps(dict(recording.metadata)))

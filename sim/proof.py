@@ -20,6 +20,7 @@ import numpy as np
 
 from sim.conceal.cases import write
 from sim.score import Mark, mark
+from sim.whole import write_text
 
 Json = dict[str, Any]
 STOPPED = 130  # exit status of a program that the operator stopped
@@ -112,8 +113,8 @@ def diagnose(campaign: Campaign, seed: int) -> None:
         said = _run(campaign, [*words, "--horizon", horizon, "--out", str(out / "unseen_sim.csv")])
     if said.returncode in (STOPPED, -signal.SIGINT, -signal.SIGTERM):
         raise InterruptedError(f"the operator stopped the diagnosis of case {seed}")  # it is not finished
-    (out / "stderr.txt").write_text(said.stderr, encoding="utf-8")
-    (out / "finished").write_text(f"{said.returncode}\n", encoding="utf-8")
+    write_text(out / "stderr.txt", said.stderr)
+    write_text(out / "finished", f"{said.returncode}\n")
 
 
 def _run(campaign: Campaign, words: list[str]) -> subprocess.CompletedProcess[str]:
@@ -189,5 +190,5 @@ def keep_failures(campaign: Campaign, marks: Sequence[Mark]) -> Path:
             f"{truth}  ->  {m.verdict}: {said}{'' if m.place_right or not a['places'] else ' (wrong place)'}{gap}"
         )
     path = campaign.out / "failures.txt"
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(lines) + "\n")
     return path

@@ -15,6 +15,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sim.whole import write_text
+
 GAIN, TAU, NOISE = 5.4, 0.23, 0.01
 CONTROLLER_GAIN, SAMPLE_TIME_S, ROWS, HELD_ROWS = 0.9, 0.02, 700, 100
 #: What is left out, and the range of its size.
@@ -168,8 +170,8 @@ def write(tie: Tie, folder: Path) -> None:
     random = np.random.default_rng((tie.seed, 2))
     gain, tau = GAIN * random.uniform(0.85, 1.15), TAU * random.uniform(0.85, 1.15)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "model.toml").write_text(MODEL.format(gain=gain, tau=tau), encoding="utf-8")
-    (folder / "config.toml").write_text(CONFIG, encoding="utf-8")
+    write_text(folder / "model.toml", MODEL.format(gain=gain, tau=tau))
+    write_text(folder / "config.toml", CONFIG)
     plant = Servo(tie.left_out, tie.size, tie.seed + 2)
     aim = np.repeat(random.uniform(-0.4, 0.4, ROWS // HELD_ROWS), HELD_ROWS)
     rows = ["t,u,y"]
@@ -178,5 +180,5 @@ def write(tie: Tie, folder: Path) -> None:
         u = CONTROLLER_GAIN * (aim[k] - y) + 0.1 * math.sin(5.0 * k * SAMPLE_TIME_S)
         plant.advance(u, SAMPLE_TIME_S)
         rows.append(f"{k * SAMPLE_TIME_S:.2f},{u:.6g},{y:.6g}")
-    (folder / "first.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    (folder / "first.toml").write_text(f'[controller]\nkind = "P"\nK = {CONTROLLER_GAIN}\n', encoding="utf-8")
+    write_text(folder / "first.csv", "\n".join(rows) + "\n")
+    write_text(folder / "first.toml", f'[controller]\nkind = "P"\nK = {CONTROLLER_GAIN}\n')

@@ -23,6 +23,7 @@ from autotune.equations.files import AnyModel
 from autotune.equations.identifiability import Combination, undetermined
 from autotune.models import Model, Parameter
 from autotune.recording import Recording
+from autotune.whole_files import write_whole
 
 Verdict: TypeAlias = Literal["none", "parameters", "effect", "unexplained"]
 
@@ -235,7 +236,7 @@ class Diagnosis:
 
     def write(self, path: Path) -> None:
         """Write diagnosis.json."""
-        path.write_text(json.dumps(self.as_json(), indent=2) + "\n", encoding="utf-8")
+        write_whole(path, json.dumps(self.as_json(), indent=2) + "\n")
 
 
 def _effect(effect: FoundEffect) -> dict[str, Any]:

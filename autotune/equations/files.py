@@ -23,6 +23,7 @@ from autotune.model_tables import read_model, write_model
 from autotune.models import Model
 from autotune.recording import Recording
 from autotune.text_files import read_toml
+from autotune.whole_files import write_whole
 
 AnyModel: TypeAlias = Model | EquationModel | BlackBox
 
@@ -79,7 +80,7 @@ def write_any(model: AnyModel, path: Path, base: Path | None = None) -> None:
     content = {"name": model.name, "fmu": str(fmu), "input": shell["input"], "output": {"value": model.source["value"]}}
     content["output"] |= {"unit": model.output_unit} if model.output_unit else {}
     content |= {key: shell[key] for key in ("parameters", "effect") if key in shell}
-    Path(path).write_bytes(tomli_w.dumps(content).encode())
+    write_whole(path, tomli_w.dumps(content))
 
 
 def forecast_any(model: EquationModel | BlackBox, recording: Recording, horizon_s: float | None = None) -> FloatArray:

@@ -26,6 +26,7 @@ from autotune.errors import InputError
 from autotune.model_tables import effect_of, effect_table, require_keys
 from autotune.models import Hold
 from autotune.text_files import read_toml
+from autotune.whole_files import write_whole
 
 _TOP = {"name", "input", "output", "state", "parameters", "define", "port", "horizon_s", "effect"}
 
@@ -256,7 +257,7 @@ def write_equations(
     equations : mapping of effect name to equation, optional
         Written into the ``[[effect]]`` tables for the reader; not read back.
     """
-    Path(path).write_bytes(tomli_w.dumps(content_of(model, equations)).encode())
+    write_whole(path, tomli_w.dumps(content_of(model, equations)))
 
 
 def content_of(model: EquationModel, equations: Mapping[str, str] | None = None) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from sim.conceal.record import Record, record, scale_of, size_effects
 from sim.conceal.retune import Chain, forecast_error, residuals, retune
 from sim.conceal.rigs import linear_truth, model_file
 from sim.conceal.sizes import Scale, Sized
+from sim.whole import write_text
 
 FILES = ("rec1", "rec2", "unseen")
 #: Bands of the retuned structure's rms residual over the noise.
@@ -175,18 +176,18 @@ def write(seed: int, folder: Path, answer_file: Path) -> dict[str, Any]:
     """
     d, records, answer = make(seed)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "model.toml").write_text(model_file(d.rig), encoding="utf-8")
+    write_text(folder / "model.toml", model_file(d.rig))
     digits = 1 if d.rig.rig == PROCESS else 3
     for name, ex, r in zip(FILES, d.excitations, records, strict=True):
         columns = [r.u, r.y, *([r.r] if ex.record_r else [])]
         rows = ["t,u,y,r" if ex.record_r else "t,u,y"]
         for k, t in enumerate(r.t):
             rows.append(f"{t:.{digits}f}," + ",".join(f"{c[k]:.6g}" for c in columns))
-        (folder / f"{name}.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+        write_text(folder / f"{name}.csv", "\n".join(rows) + "\n")
         stated = "".join(f"{k} = {json.dumps(v) if isinstance(v, str) else f'{v:g}'}\n" for k, v in ex.stated.items())
         units = f'[units]\nt = "s"\nu = "{d.rig.unit_u}"\ny = "{d.rig.unit_y}"\n'
         head = f'rig = "{d.rig.rig}"\nsample_time = {d.rig.Ts:g}\n'
-        (folder / f"{name}.toml").write_text(f"{head}{units}[controller]\n{stated}", encoding="utf-8")
+        write_text(folder / f"{name}.toml", f"{head}{units}[controller]\n{stated}")
     answer_file.parent.mkdir(parents=True, exist_ok=True)
-    answer_file.write_text(json.dumps(answer, indent=1), encoding="utf-8")
+    write_text(answer_file, json.dumps(answer, indent=1))
     return answer

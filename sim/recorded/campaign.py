@@ -18,6 +18,7 @@ from sim.recorded import cases
 from sim.recorded.cases import Ready
 from sim.recorded.rigs import RefusedError, find
 from sim.score import Mark, mark
+from sim.whole import write_text
 
 Json = dict[str, Any]
 ALARMS = ("unexplained", "failed")
@@ -81,7 +82,7 @@ def open_campaign(folder: Path, out: Path, count: int | None, seed: int, tool: t
     if kept.exists() and kept.read_text(encoding="utf-8") != stamps:
         raise RefusedError(f"the campaign in {out} was begun with other recordings")
     out.mkdir(parents=True, exist_ok=True)
-    kept.write_text(stamps, encoding="utf-8")
+    write_text(kept, stamps)
     count = 3 * len(rigs) if count is None else count
     return RecordedCampaign(
         cases=Campaign(out=out, seeds=range(seed, seed + count), tool=tool),

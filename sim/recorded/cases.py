@@ -21,6 +21,7 @@ from sim.recorded import chain as linear
 from sim.recorded.effects import EFFECTS, Effect, require_exact, require_no_converter
 from sim.recorded.readings import Put, Scale
 from sim.recorded.rigs import Record, RefusedError, Rig
+from sim.whole import write_text
 
 #: Cases of a round through all effects that change numbers only; steps through the effects from rig to rig.
 NUMBERS, STRIDE = 3, 5
@@ -342,7 +343,7 @@ def conceal(seed: int, rigs: Sequence[Ready], folder: Path, answer_file: Path) -
     made = make(seed, rigs)
     write(folder, made.ready.rig, made.given, made.kept_back)
     answer_file.parent.mkdir(parents=True, exist_ok=True)
-    answer_file.write_text(json.dumps(answer(made, seed), indent=1), encoding="utf-8")
+    write_text(answer_file, json.dumps(answer(made, seed), indent=1))
 
 
 def keep_as_recorded(ready: Ready, folder: Path, answer_file: Path) -> None:
@@ -362,4 +363,4 @@ def keep_as_recorded(ready: Ready, folder: Path, answer_file: Path) -> None:
     spread = _spread(rig, rig.kept_back[longest(rig.kept_back)]) if rig.kept_back else None
     answer_file.parent.mkdir(parents=True, exist_ok=True)
     said = {"kind": "as recorded", "rig": rig.name, "horizon": rig.horizon * rig.Ts, "spread": spread}
-    answer_file.write_text(json.dumps(said, indent=1), encoding="utf-8")
+    write_text(answer_file, json.dumps(said, indent=1))

@@ -5,19 +5,36 @@ from __future__ import annotations
 import json
 import shutil
 import tomllib
+import zipfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import fmpy
 import numpy as np
 import pytest
+import typer
 
+from autotune import cli
+from autotune.api.examples import BALL
+from autotune.model_tables import write_model
+from autotune.points import points_to_json
 from tests.autotune import moments_of_writing
+from tests.autotune.equations.fmu_build import description
+from tests.autotune.test_cli_prove import CLEAN
+from tests.autotune.test_pipeline import points_of
+from tests.autotune.test_pipeline_investigation import WITHOUT, tanks_model
 from tests.forked import call
 from tests.fuzz.moments import CONFIG, inputs
 
 CONTROLLER = 'kind = "pi"\nK = 0.5\nTi_s = 1.0\n'
 LAG = 'name = "lag"\n\n[[block]]\nname = "plant"\nplace = "plant"\nnum = [2.0]\nden = [1.0, 1.0]\n'
 #: Journals: they grow by whole lines, at their own place.
-GROWING = {"run": ("progress.jsonl", "recording.csv", "verification.csv", "journal.jsonl", "audit.jsonl")}
+GROWING = {
+    "run": ("progress.jsonl", "recording.csv", "verification.csv", "journal.jsonl", "audit.jsonl"),
+    "deploy": ("journal.jsonl", "audit.jsonl"), "verify": ("verification.csv",), "dither": ("d.csv",),
+    "investigate": ("rig_1.csv",),
+}  # fmt: skip
 #: What a command is given and the results that it writes.
 COMMANDS: dict[str, tuple[list[str], tuple[str, ...]]] = {
     "schema": (["schema", "--out", "o/s.json"], ("o/s.json",)),
@@ -38,7 +55,11 @@ COMMANDS: dict[str, tuple[list[str], tuple[str, ...]]] = {
         ("o/diagnosis.json", "o/extended_model.toml", "o/report.html"),
     ),
     "diagnose --routine": (["diagnose", "--routine", "swing.csv", "--out", "o"], ("o/routine.json", "o/report.html")),
-    "model from-matlab": (["model", "from-text", "2/(s+1)", "--out", "o/m.toml"], ("o/m.toml",)),
+    "model from-text": (["model", "from-text", "2/(s+1)", "--out", "o/m.toml"], ("o/m.toml",)),
+    "model from-matlab": (["model", "from-matlab", "[2]", "[1 1]", "--out", "o/m.toml"], ("o/m.toml",)),
+    "model from-control": (["model", "from-control", "system.py:lag", "--out", "o/m.toml"], ("o/m.toml",)),
+    "model from-fmu": (["model", "from-fmu", "rig.fmu", "--out", "o/m.toml"], ("o/m.toml",)),
+    "model linearise": (["model", "linearise", "lag.toml", "--at", "u=1", "--out", "o/m.toml"], ("o/m.toml",)),
     "model export": (["model", "export", "lag.toml", "--form", "text", "--out", "o/m.txt"], ("o/m.txt",)),
     "reference": (
         ["reference", "--model", "model.toml", "--u-min", "-3", "--u-max", "3", "--out", "o/r.csv"], ("o/r.csv",),
@@ -54,8 +75,22 @@ COMMANDS: dict[str, tuple[list[str], tuple[str, ...]]] = {
     ),
     "import": (["import", "r.csv", "--out", "o/r.csv"], ()),
     "init": (["init", "rig.toml", "--kind", "simulated", "--plant", "ball"], ()),
+    "paper relay": (["paper", "relay", "--out", "o/p.html"], ("o/p.html",)),
+    "paper delay": (["paper", "delay", "--sets", "2", "--out", "o/p.html"], ("o/p.html",)),
+    "paper closed-loop": (["paper", "closed-loop", "--sets", "1", "--out", "o/p.html"], ("o/p.html",)),
+    "dither": (["dither", str(CONFIG), "--duration", "3", "--amplitude", "0.1", "--out", "o/d.csv"], ()),
+    "deploy": (["deploy", str(CONFIG), "--controller", "ball_pi.toml", "--no-verify", "--yes", "--out", "o"], ()),
+    "verify": (
+        ["verify", str(CONFIG), "--points", "ball.json", "--controller", "ball_pi.toml", "--out", "o"], (),
+    ),
+    "investigate": (
+        ["investigate", str(CONFIG.with_name("two_tank_sim.toml")), "--model", "tanks.toml", "--rounds", "1",
+         "--duration", "200", *(word for name in WITHOUT for word in ("--without", name)), "--out", "o"],
+        (),
+    ),
+    "prove": (["prove", "--cases", "1", "--seed", str(CLEAN), "--ties", "0", "--workers", "1", "--out", "o"], ()),
     "batch": (["batch", "campaign.toml", "--out", "o", "--workers", "1"], ()),
-    "run": (["run", str(CONFIG), "--out", "o"], ()),
+    "run": (["run", str(CONFIG), "--diagnose", "--out", "o"], ()),
 }  # fmt: skip
 
 OLD = b"# another result\n"
@@ -69,6 +104,14 @@ def kept(tmp_path: Path, command: list[str], results: tuple[str, ...]) -> list[P
     inputs(work)
     (work / "c.toml").write_text(CONTROLLER)
     (work / "lag.toml").write_text(LAG)
+    (work / "system.py").write_text("import control\nlag = control.tf([2.0], [1.0, 1.0])\n")
+    with zipfile.ZipFile(work / "rig.fmu", "w") as archive:
+        archive.writestr("modelDescription.xml", description(("CoSimulation",)))
+        archive.writestr(f"binaries/{fmpy.platform}/rig{fmpy.sharedLibraryExtension}", b"")
+    write_model(tanks_model(), work / "tanks.toml", {})
+    (work / "ball_pi.toml").write_text('kind = "pi"\nK = -0.02\nTi_s = 3.6\n')
+    ball = points_of(BALL, np.array([0.9, 1.5, 2.4, 3.5, 5.0]), 0.004)
+    (work / "ball.json").write_text(json.dumps({"points": points_to_json(ball)}))
     (work / "short.csv").write_text("".join((work / "r.csv").read_text().splitlines(keepends=True)[:400]))
     swing = np.sin(np.arange(400) / 4.0)
     np.savetxt(work / "swing.csv", np.column_stack([np.arange(400), swing, np.roll(swing, 3)]), header="t,u,y",
@@ -100,6 +143,18 @@ def assert_whole(file: Path) -> None:
             assert content.endswith(b"\n")
         case ".html":
             assert content.rstrip().endswith(b"</html>")
+
+
+def writing(command: Any, *words: str) -> Iterator[str]:
+    """Yield the commands, below this one, that have a place to write to."""
+    for name, below in getattr(command, "commands", {}).items():
+        yield from writing(below, *words, name)
+    if any("--out" in option.opts for option in command.params):
+        yield " ".join(words)
+
+
+def test_every_command_that_writes_is_killed_here() -> None:
+    assert set(writing(typer.main.get_command(cli.app))) <= set(COMMANDS)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -12,6 +11,7 @@ import numpy as np
 from autotune.diagnosis.routine.operation import Operation
 from autotune.diagnosis.routine.oscillation import SetpointAnswer
 from autotune.diagnosis.routine.valves import Interval, ValveComparison
+from autotune.whole_files import write_json
 
 Verdict: TypeAlias = Literal["stiction", "backlash", "tight_tuning", "outside_oscillation", "none", "abstain"]
 
@@ -125,7 +125,7 @@ class RoutineDiagnosis:
 
     def write(self, path: Path) -> None:
         """Write routine.json."""
-        path.write_text(json.dumps(self.as_json(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        write_json(path, self.as_json())
 
 
 def _number(value: float) -> float | None:
