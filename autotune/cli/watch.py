@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class _Tracking:
-    """What is tracked and judged; times in s, None where they follow from the record's length."""
+    """What is tracked and judged; order and times [s] are None where they follow from the record."""
 
-    order: int
+    order: int | None
     window_s: float | None
     every_s: float | None
     max_delay_s: float | None
@@ -52,7 +52,12 @@ def watch(
     controller: Annotated[
         Path | None, typer.Option(help="the deployed controller, TOML; its margins are judged on the tracked model")
     ] = None,
-    order: Annotated[int, typer.Option(min=1, max=4, help="order n of the tracked model, 1 to 4")] = 2,
+    order: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=4, help="order n of the tracked model, 1 to 4; default 2 or 1, what the recording determines"
+        ),
+    ] = None,
     window: Annotated[
         float | None, typer.Option(min=1e-6, help="length of y each fit uses [s]; default a fifth of it")
     ] = None,
@@ -161,9 +166,10 @@ def _follow(recording: Path, out: Output, settings: _Tracking, quiet_s: float) -
                 rows = len(record)
                 length = settings.window_s if settings.window_s is not None else 0.2 * record.duration_s
                 if quiet_s == 0.0 or record.t[-1] - record.t[0] >= length:
+                    settings = settings if settings.order else _with_structure(record, settings, length)
                     for fitted in track(
                         record,
-                        settings.order,
+                        settings.order or 2,
                         window_s=length,
                         every_s=settings.every_s if settings.every_s is not None else 0.25 * length,
                         max_delay_s=settings.max_delay_s,
@@ -182,6 +188,24 @@ def _follow(recording: Path, out: Output, settings: _Tracking, quiet_s: float) -
         typer.echo(f"retune: the controller misses its margins on the tracked model since t = {retune_at:.4g} s")
     nothing = f"no window determined the model; {out.path} was not written"
     typer.echo(f"wrote {out.path}" if done > -math.inf else nothing)
+
+
+def _with_structure(record: Recording, settings: _Tracking, window_s: float) -> _Tracking:
+    """Return the settings with the order that the record determines, and say it."""
+    from autotune.identification.delay.tracking import choose_structure
+
+    chosen = choose_structure(
+        record,
+        window_s=window_s,
+        max_delay_s=settings.max_delay_s,
+        hold=settings.hold,
+        integrator=settings.integrator,
+    )
+    if chosen is None:  # each window says why
+        return settings
+    kind = "an integrating plant" if chosen.integrator else "a plant"
+    typer.echo(f"{kind} of order {chosen.order} is tracked, as the recording determines; --order sets another")
+    return replace(settings, order=chosen.order, integrator=chosen.integrator)
 
 
 def _in_operation(record: Recording) -> Recording | None:

@@ -142,6 +142,52 @@ def track(
             yield Window(end_s=float(at), model=None, reason=error.what)
 
 
+def choose_structure(
+    recording: Recording,
+    *,
+    window_s: float,
+    max_delay_s: float | None = None,
+    hold: Hold | None = None,
+    integrator: bool = False,
+) -> Structure | None:
+    """Return the order, 2 or 1, that a recording's windows determine, and whether its plant integrates.
+
+    Parameters
+    ----------
+    recording : Recording
+        Normal operation, in open or closed loop.
+    window_s : float
+        Length of the windows that are to be fitted [s].
+    max_delay_s : float, optional
+        Largest delay considered [s]; half the window where not given.
+    hold : {"zero", "linear"}, optional
+        How u runs between rows.
+    integrator : bool
+        Whether a_0 = 0 is known.
+
+    Returns
+    -------
+    Structure or None
+        Of the window that determines one and in which u moves most. It has an integrator where the 95 % interval of a_0
+        holds zero: that of the gain -b/a_0 would then have no end. None where no window determines either order.
+    """
+    largest = 0.5 * window_s if max_delay_s is None else max_delay_s
+    starts = np.arange(recording.t[0], recording.t[-1] - window_s * (1.0 - 1e-9), window_s)
+    windows = [recording.between(float(start), float(start) + window_s) for start in starts]
+    for window in sorted(windows, key=lambda part: -float(np.nansum(np.abs(np.diff(part.u))))):
+        for order in (2, 1):
+            try:
+                require_answer([window])
+                model = identify_delay(
+                    window, order, max_delay_s=largest, hold=hold, integrator=integrator, skip_missing=True
+                )
+            except IdentificationError:
+                continue
+            unbounded = abs(model.a[0]) <= 1.96 * model.standard_deviations[0]
+            return Structure(order=order, integrator=integrator or bool(unbounded))
+    return None
+
+
 def _fit_window(fit: Callable[[DelayModel | None], DelayModel], last: DelayModel | None) -> DelayModel:
     """Start from the last window's model, and search anew where that explains the window clearly worse."""
     if last is not None:

@@ -137,6 +137,35 @@ def test_a_reason_that_stays_the_same_is_said_once(tmp_path):
     assert all(line.endswith("not determined, as before") for line in others)
 
 
+@pytest.mark.parametrize(
+    ("num", "den", "said", "wanted"),
+    [
+        ([0.8], [9.0, 1.0], "a plant of order 1", {"gain": 0.8, "time_constant_1": 9.0}),
+        ([-65.5], [0.36, 1.0, 0.0], "an integrating plant of order 2", {"gain": -65.5, "time_constant_1": 0.36}),
+    ],
+    ids=["one lag", "a ball"],
+)
+def test_what_the_windows_determine_is_tracked_where_no_order_is_given(tmp_path, num, den, said, wanted):
+    """Of a single lag no window determines order 2; of an integrator the gain at rest has no end."""
+    from scipy.signal import lsim
+
+    slowest = den[0]
+    t = np.arange(2000) * 0.02 * slowest
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.permutation(np.tile([-1.0, 1.0], 50)), 20)
+    y = lsim((num, den), u, t, interp=False)[1] + 1e-3 * abs(num[0]) * slowest * rng.standard_normal(t.size)
+    write_recording(Recording(t=t, u=u + 5.0, y=y + 5.0), tmp_path / "rec.csv")
+    watched = CliRunner().invoke(app, ["watch", str(tmp_path / "rec.csv"), "--out", str(tmp_path / "w.csv")])
+    assert watched.exit_code == 0, watched.output
+    assert said in watched.output
+    header, *rows = (tmp_path / "w.csv").read_text().splitlines()
+    table = np.genfromtxt(rows, delimiter=",", names=header.split(","))
+    assert len(table) >= 10
+    for name, value in wanted.items():
+        assert np.mean(np.abs(table[name] - value) < 1.96 * table[name + "_sd"]) > 0.75
+        assert table[name] == pytest.approx(np.full(len(table), value), rel=0.1)
+
+
 def test_a_window_longer_than_the_record_is_refused():
     with pytest.raises(InputError, match="window 1000 s"):
         next(track(loop_in_operation(), 2, window_s=1000.0, every_s=10.0))
