@@ -16,6 +16,13 @@ if TYPE_CHECKING:
     from autotune.pipeline.investigation import Investigation
 
 ROUNDS = "rounds.json"
+#: what a verdict says after a round
+_SAID = {
+    "none": "the simulation explains the recordings",
+    "parameters": "the structure is right, its numbers are not",
+    "effect": "physics was left out",
+    "unexplained": "something is missing that no hypothesis explains",
+}
 
 
 @app.command()
@@ -73,7 +80,7 @@ def investigate(
     for one in known.rounds:
         kind, on = one.plan.excitation.kind, one.plan.excitation.on
         best = list_candidates(one.candidates, one.verdict)
-        typer.echo(f"round {one.number}, {kind} on the {on}: {one.verdict}; {best}")
+        typer.echo(f"round {one.number}, {kind} on the {on}: {_SAID[one.verdict]}; {best}")
     found = known.diagnosis
     if found is not None:
         described = () if found.description is None else (found.description.sentence,)

@@ -428,4 +428,5 @@ def equation_of(model: EquationModel, effect: Effect) -> str:
         return f"{effect.port} = {to_text(tree)}"
     shares = joint_at(model, effect.state).shares.items()
     also = "".join(f"; d {name}/dt: that times {to_text(share)}" for name, share in shares)
-    return f"d {effect.state}/dt: + {to_text(tree)}{also}"
+    added = to_text(tree)
+    return f"d {effect.state}/dt: {f'- {added[1:]}' if added.startswith('-') else f'+ {added}'}{also}"

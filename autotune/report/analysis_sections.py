@@ -140,14 +140,14 @@ def _validation_row(validation: Validation) -> tuple[str, str, str, str, str]:
 def _transfer_text(fit: PlantFit, signals: SignalSettings) -> str:
     plant = fit.plant
     slow = [p for p in plant.poles if p != 0.0 and p.imag >= 0.0]
-    lags = ", ".join(f"{-1.0 / p.real:.3g} s" for p in slow if p.imag == 0.0)
+    lags = [f"{-1.0 / p.real:.3g} s" for p in slow if p.imag == 0.0]
     pairs = "".join(
         f", an oscillating pair at {abs(p):.3g} rad/s with damping {-p.real / abs(p):.2g}" for p in slow if p.imag > 0.0
     )
     gain = plant.num[-1] / plant.den[-1 - plant.integrators]
     kind = "integrator" if plant.integrators else "no integrator"
     size = with_units(gain, signals.y_unit, f"{signals.u_unit} s" if plant.integrators else signals.u_unit)
-    lagging = f"lags {lags}" if lags else "no lag"
+    lagging = f"lag{'s' * (len(lags) > 1)} {', '.join(lags)}" if lags else "no lag"
     return f"gain {size}, {kind}, {lagging}{pairs}, dead time {plant.delay_s:.3g} s"
 
 
@@ -176,17 +176,22 @@ def _loop_section(analysis: Analysis, signals: SignalSettings) -> Section:
             + ".",
         ),
         tables=(
-            Table(
-                caption="The controller on what it was designed with, and on the fitted plant",
-                header=("", "designed on", "fitted plant"),
-                rows=rows,
-            ),
+            _margins_table(analysis.source, rows),
             maker_table(controller),
         ),
-        details=(_certificate(analysis),),
+        details=(f"Certificate: {analysis.design.certificate}.",),
         detail_tables=(_price_table(analysis, signals),),
         figures=_loop_figures(analysis),
     )
+
+
+def _margins_table(source: str, rows: Sequence[tuple[str, str, str]]) -> Table:
+    """Return gains and margins, once where the controller was designed on the fitted plant itself."""
+    if source == "fitted plant":
+        caption = "On the fitted plant, which the controller was designed on"
+        return Table(caption=caption, header=("", source), rows=tuple(row[:2] for row in rows))
+    caption = f"On the {source}, which the controller was designed on, and on the fitted plant"
+    return Table(caption=caption, header=("", source, "fitted plant"), rows=tuple(rows))
 
 
 def _loop_figures(analysis: Analysis) -> tuple[Figure, ...]:
@@ -287,11 +292,6 @@ def _price_table(analysis: Analysis, signals: SignalSettings) -> Table:
         ),
         rows=tuple(rows),
     )
-
-
-def _certificate(analysis: Analysis) -> str:
-    text = analysis.design.certificate
-    return f"Certificate: {text}."
 
 
 def warnings_sections(warnings: Sequence[str]) -> tuple[Section, ...]:

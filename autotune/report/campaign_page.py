@@ -206,7 +206,7 @@ _FAILED: _Columns = {"file": lambda row: row.file.rsplit("/", 1)[-1], "record": 
 _COLUMNS: dict[str, _Columns] = {
     "identify": {
         "points": lambda row: str(row.points or ""),
-        "from to [rad/s]": _range,
+        "range [rad/s]": _range,
         "record": _record,
     },
     "design": {

@@ -18,8 +18,8 @@ from autotune.equations.typeset import as_mathml
 from autotune.errors import InputError
 from autotune.models import Parameter
 from autotune.report.chain_diagram import chain_diagram
-from autotune.report.diagnosis_words import answers, in_the_model, objections, places_of, verdict_of
-from autotune.report.effect_words import clause, in_short, number, of_candidates, sentence, with_spread
+from autotune.report.diagnosis_words import answers, how_they_add_up, in_the_model, objections, places_of, verdict_of
+from autotune.report.effect_words import clause, in_short, number, of_candidates, sentence, typeset_unit, with_spread
 from autotune.report.law_figures import acting_figure, file_names, free_run_figure, law_figure
 from autotune.report.page import Figure, Page, Section, Table, Tone, write_page
 from autotune.report.screen_figures import curve_figure, over_time, screen_sections, trace_figures
@@ -132,7 +132,7 @@ def _numbers(found: Diagnosis) -> Table:
     for n in numbers:
         fits = (n.retuned, n.value) if extended else (n.retuned,)
         said = [with_spread(Parameter(value=value, sd=sd)) if sd > 0.0 else number(value) for value, sd in fits]
-        rows.append((*((n.block,) if of_blocks else ()), n.name, n.unit or "-", number(n.nominal), *said))
+        rows.append((*((n.block,) if of_blocks else ()), n.name, typeset_unit(n.unit) or "-", number(n.nominal), *said))
     header = (*(("block",) if of_blocks else ()), "number", "unit", "nominal", "retuned")
     return Table(
         header=(*header, "extended") if extended else header, rows=tuple(rows),
@@ -164,7 +164,7 @@ def _equations(found: Diagnosis) -> tuple[Section, ...]:
 
 
 def _share(error: float) -> str:
-    return f"{100 * error:.3g} %" if np.isfinite(error) else "runs away"
+    return f"{number(100 * error, 3)} %" if np.isfinite(error) else "runs away"
 
 
 def _missing(known: _Evidence) -> tuple[Section, ...]:
@@ -275,7 +275,7 @@ def _against(known: _Evidence) -> Section:
     odds = Table(
         header=("explanation", "probability"), rows=tuple(rows[:_RIVALS]),
         caption="All explanations that were weighed, the likeliest first, by all rows and the parts that leave some"
-        " out. An effect's own probability is the sum of those that have it.",
+        f" out. {how_they_add_up(found.effects, found.candidates)}",
     )  # fmt: skip
     ranked = found.search.hypotheses()
     table = Table(

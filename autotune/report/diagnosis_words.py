@@ -10,6 +10,7 @@ import numpy as np
 from autotune.diagnosis.evidence.missing_law import MissingLaw
 from autotune.diagnosis.evidence.unseen_run import UnseenRun
 from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment
+from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.verdict import OFFSET
 from autotune.effects import kind_of
 from autotune.report.effect_words import clause, in_short, join_clauses, of_candidate, sentence, unit_of, with_spread
@@ -18,6 +19,8 @@ from autotune.report.effect_words import clause, in_short, join_clauses, of_cand
 _SURE, _LIKELY = 0.9, 0.6
 #: Share of the bins that may leave a law before that is said against it.
 _BINS_OFF = 0.25
+#: Difference of two probabilities that a page shows as different.
+_APART = 0.01
 
 
 def verdict_of(found: Diagnosis) -> str:
@@ -258,3 +261,19 @@ def _of_effect(effect: FoundEffect) -> list[str]:
     if unfelt and kind.is_simulated:
         said.append(f"The recordings do not say how exact {join_clauses(unfelt)} of {in_short(effect.name)} is.")
     return said
+
+
+def how_they_add_up(effects: Sequence[FoundEffect], candidates: Sequence[Candidate]) -> str:
+    """Say how the effects' probabilities go with those of the explanations that have them.
+
+    Parameters
+    ----------
+    effects : sequence of FoundEffect
+        What is named.
+    candidates : sequence of Candidate
+        Explanations.
+    """
+    sums = {e.name: sum(c.probability for c in candidates if e.name in c.name.split("+")) for e in effects}
+    less = [e.name for e in effects if sums[e.name] > e.probability + _APART]
+    adds_up = "An effect's own probability is the sum of those that have it"
+    return f"{adds_up}, but for {join_clauses(less)}, of which parts tell less." if less else f"{adds_up}."

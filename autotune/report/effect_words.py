@@ -51,7 +51,12 @@ def number(value: float, digits: int = 4) -> str:
 def unit_of(unit: str) -> str:
     """Return a unit as it stands after a number: nothing where there is none."""
     unit = unit.replace("-/s", "1/s") if unit.startswith("-/") else unit
-    return "" if unit in ("-", "") else f" {unit}"
+    return "" if unit in ("-", "") else f" {typeset_unit(unit)}"
+
+
+def typeset_unit(unit: str) -> str:
+    """Return a unit with its squares and cubes as they are printed."""
+    return unit.replace("^2", "²").replace("^3", "³")
 
 
 def with_spread(p: Parameter, digits: int = 4) -> str:
@@ -62,10 +67,15 @@ def with_spread(p: Parameter, digits: int = 4) -> str:
     p : Parameter
         Value, standard deviation and unit.
     digits : int
-        Significant ones of the value.
+        Significant ones of a value without an interval; one with an interval ends where its interval does.
     """
-    spread = f" ± {number(1.96 * p.sd, 2)}" if math.isfinite(p.sd) else ""
-    return f"{number(p.value, digits)}{spread}{unit_of(p.unit)}"
+    half = 1.96 * p.sd
+    if not math.isfinite(half):
+        return f"{number(p.value, digits)}{unit_of(p.unit)}"
+    decimals = 1 - math.floor(math.log10(half)) if half > 0.0 else math.inf
+    if not 0 <= decimals <= 7:
+        return f"{number(p.value, digits)} ± {number(half, 2)}{unit_of(p.unit)}"
+    return f"{p.value:.{decimals}f} ± {half:.{decimals}f}{unit_of(p.unit)}"
 
 
 def of_candidate(name: str, *, beside: bool = False) -> str:

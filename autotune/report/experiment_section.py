@@ -11,6 +11,7 @@ from autotune.config.procedure import SignalSettings
 from autotune.experiment.leaving import sentence
 from autotune.experiment.result import ExperimentResult, Segment
 from autotune.experiment.sweep_warnings import relative_sd
+from autotune.experiment.timing import Timing
 from autotune.identification.sweep_adequacy import TESTS
 from autotune.identification.sweep_estimate import LEVEL
 from autotune.recording import Recording
@@ -61,9 +62,7 @@ def experiment_section(
             f" {signals.y_unit}.",
             *_together_text(experiment),
             f"The sweep {_how_it_ended(experiment.reason)}; {sentence(experiment.output)}.",
-            f"Link latency {_milliseconds(timing.latency_s)}, lateness of the loop {_milliseconds(timing.lateness_s)},"
-            f"{_decision(timing.decision_s)}"
-            f" (median, 99 %, worst); {timing.missed} sample(s) missed, {timing.unusable} unusable.",
+            f"{_lateness(timing)}{timing.missed} sample(s) missed, {timing.unusable} unusable.",
         ),
         tables=(*((sittings,) if len(parts) > 1 else ()), _dwell_table(experiment)),
         figures=(
@@ -82,12 +81,11 @@ def _together_text(experiment: ExperimentResult) -> tuple[str, ...]:
     found = experiment.together
     if found is None:
         return (f"Each point is of a limit cycle of its own: {experiment.by_itself}.",) if experiment.by_itself else ()
-    tests = ", ".join(f"{what} {p:.2g}" for what, p in zip(TESTS, found.p_values, strict=True))
+    tests = ", ".join(f"{what} (probability {p:.2g})" for what, p in zip(TESTS, found.p_values, strict=True))
     return (
         f"The points are estimated together from all rows between {found.start_s:.4g} and {found.end_s:.4g} s. What the"
-        f" fitted equation leaves shows nothing else: the probabilities of as much by noise alone are {tests}; so"
-        f" small ones that noise gives them in {100 * LEVEL:.0f} of 100 sweeps would have had each point measured by"
-        " itself.",
+        f" fitted equation leaves is noise: noise alone looks as much like {tests}. With probabilities so small that"
+        f" noise gives them in {100 * LEVEL:.0f} of 100 sweeps each point would be measured by itself.",
     )
 
 
@@ -103,6 +101,16 @@ def _dwell_table(experiment: ExperimentResult) -> Table:
     header = ("cycle", "aimed at [deg]", "ω [rad/s]", "periods", "dwell [s]", "its own rows know its point to",
               "one period more, to")  # fmt: skip
     return Table(header=header, rows=tuple(rows))
+
+
+def _lateness(timing: Timing) -> str:
+    """Return how late samples and commands were; nothing of a rig whose clock waits for them."""
+    if not any(timing.latency_s + timing.lateness_s):
+        return ""
+    return (
+        f"Link latency {_milliseconds(timing.latency_s)}, lateness of the loop {_milliseconds(timing.lateness_s)},"
+        f"{_decision(timing.decision_s)} (median, 99 %, worst); "
+    )
 
 
 def _decision(values: tuple[float, float, float]) -> str:

@@ -144,17 +144,23 @@ def bode_figure(
                 row=row,
                 col=1,
             )
-    figure.update_xaxes(type="log")
+    figure.update_xaxes(type="log", dtick=log_ticks([omega]))
     figure.update_xaxes(title="angular frequency [rad/s]", row=2, col=1)
-    figure.update_yaxes(type="log", title=axis_title("gain", gain_unit), dtick=_log_ticks(gains), row=1, col=1)
+    figure.update_yaxes(type="log", title=axis_title("gain", gain_unit), dtick=log_ticks(gains), row=1, col=1)
     low, high, step = phase_axis(measured, drawn)
     room = 0.05 * (high - low)  # the lowest tick's number is not to meet the first one of the frequency axis
     figure.update_yaxes(title="phase [deg]", dtick=step, range=[low - room, high], row=2, col=1)
     return figure
 
 
-def _log_ticks(drawn: Sequence[FloatArray]) -> str | int:
-    """Return the ticks of a logarithmic axis over these values: 1, 2, 5 up to three decades, then powers of ten."""
+def log_ticks(drawn: Sequence[FloatArray]) -> str | int:
+    """Return the ticks of a logarithmic axis: 1, 2, 5 up to three decades, then powers of ten.
+
+    Parameters
+    ----------
+    drawn : sequence of (N,) array
+        What is drawn along the axis, in any unit.
+    """
     values = np.concatenate([*drawn, np.empty(0)])
     values = values[np.isfinite(values) & (values > 0.0)]
     return "D2" if values.size and np.max(values) < 1e3 * np.min(values) else 1

@@ -15,7 +15,7 @@ from autotune.diagnosis.evidence.unseen_run import UnseenRun
 from autotune.recording import Recording
 from autotune.report import chart as go
 from autotune.report.chart import make_subplots
-from autotune.report.effect_words import clause, sentence
+from autotune.report.effect_words import clause, number, sentence, typeset_unit
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, Figure, add_line, lines_figure, thin_curve
 
 _COLOURS = {"nominal": PURPLE, "retuned": ORANGE, "extended": BLUE}
@@ -36,7 +36,7 @@ def file_names(recordings: Sequence[Recording]) -> tuple[str, ...]:
 
 def _with_unit(name: str, unit: str) -> str:
     """Return an axis's title."""
-    return f"{name} [{unit}]" if unit else f"{name} [-]"
+    return f"{name} [{typeset_unit(unit) or '-'}]"
 
 
 def free_run_figure(run: UnseenRun, name: str) -> Figure:
@@ -76,7 +76,8 @@ def free_run_figure(run: UnseenRun, name: str) -> Figure:
 
 def _caption_of_run(run: UnseenRun, name: str) -> str:
     errors = ", ".join(
-        f"{model} {100 * e:.3g} %" if math.isfinite(e) else f"{model} runs away" for model, e in run.errors.items()
+        f"{model} {number(100 * e, 3)} %" if math.isfinite(e) else f"{model} runs away"
+        for model, e in run.errors.items()
     )
     once = len(run.starts_s) == 1
     how = "One free run" if once else f"{len(run.starts_s)} free runs, as long as this plant lets a simulation run,"

@@ -32,6 +32,12 @@ FAMILY, APART = (0.4, 0.6, 0.7, 0.8), 0.04
 _SAMPLES, _CROSSOVERS, _INTEGRALS, _DEAD_TIMES = 500, 14.0, 5.0, 8.0
 #: Overshoot above which a set-point weight is offered, and the weights that are tried.
 OVERSHOOT, WEIGHTS = 0.1, (0.8, 0.6, 0.4, 0.2, 0.0)
+_SLIDER = (
+    "The slider goes from careful to fast, to controllers of other modulus margins M_m on the fitted plant; the band is"
+    " that of the designed one, which keeps what was asked on the region."
+)
+#: A band that is nowhere wider than this share of what is drawn is not seen beside its line.
+_SEEN = 0.01
 #: A response that leaves this many times the step is of a loop that is not stable: its band ends there.
 _FAR = 20.0
 
@@ -90,8 +96,8 @@ def outlook_section(
             title="What the loop will do",
             text=(
                 f"Predicted, not measured: a step of the set-point by {_amount(1.0, signals.y_unit)}, then one of the"
-                f" load by {_amount(load, signals.u_unit)}. The band holds 95 % of {DRAWS} plants drawn from what the"
-                " data leave open.",
+                f" load by {_amount(load, signals.u_unit)}. The band{_band_width(designed)} holds 95 % of {DRAWS}"
+                " plants drawn from what the data leave open.",
                 *_gain_text(designed, before, "today's gains"),
                 *_weight_text(designed, fit.plant, times, load),
             ),
@@ -113,8 +119,7 @@ def outlook_section(
             figures=(
                 Figure(
                     figure=_figure(family, designed, before, times, signals),
-                    caption="The slider goes from careful to fast, to controllers of other modulus margins M_m on the"
-                    " fitted plant; the band is that of the designed one, which keeps what was asked on the region.",
+                    caption=_SLIDER if len(family) > 1 else "",
                     height_px=600,
                 ),
             ),
@@ -230,6 +235,13 @@ def _family(analysis: Analysis, times: FloatArray, load: float) -> list[Member]:
         # named by what it keeps: where another margin or the noise gain binds, that is not what was asked
         found.append(replace(member, name=f"M_m\u00a0{member.kept.modulus:.2f}"))
     return found
+
+
+def _band_width(member: Member) -> str:
+    """Say that a band is not to be seen, where its line covers it."""
+    prediction = member.prediction
+    widest = float(np.nanmax(prediction.high - prediction.low))
+    return ", narrower than its line," if widest < _SEEN * float(np.ptp(prediction.y)) else ""
 
 
 def _row(member: Member, sample_s: float) -> tuple[str, ...]:

@@ -145,10 +145,13 @@ def _points_table(points: Sequence[FrequencyPoint], sign: int, gain_unit: str) -
     rows = []
     for point, phase in zip(points, phases, strict=True):
         sd = math.sqrt(np.trace(np.array(point.covariance)) / 2.0) / point.gain
-        cells = (f"{point.omega_rad_s:.4g}", f"{point.gain:.5g}", f"{phase:.2f}")
-        rows.append((*cells, f"{number(196 * sd, 2)} %", number(math.degrees(1.96 * sd), 2), point.source))
-    gain = f"gain [{gain_unit}]" if gain_unit else "gain"
-    header = ("ω [rad/s]", gain, "phase [deg]", "gain ±95 %", "phase ±95 % [deg]", "kind")
+        half = 1.96 * max(sd, 1e-6)
+        gain = f"{point.gain:.{min(2 - math.floor(math.log10(half)), 5)}g}"  # as far as the interval tells, and a digit
+        turned = f"{phase:.{min(max(1 - math.floor(math.log10(math.degrees(half))), 0), 2)}f}"
+        told = (f"{number(196 * sd, 2)} %", number(math.degrees(1.96 * sd), 2))
+        rows.append((f"{point.omega_rad_s:.4g}", gain, turned, *told, point.source))
+    title = f"gain [{gain_unit}]" if gain_unit else "gain"
+    header = ("ω [rad/s]", title, "phase [deg]", "gain ±95 %", "phase ±95 % [deg]", "kind")
     return Table(header=header, rows=tuple(rows))
 
 

@@ -74,9 +74,10 @@ def _signals(found: RoutineDiagnosis) -> Section:
     figure.update_yaxes(title=axis_title("y", operation.y_unit), row=1, col=1)
     figure.update_yaxes(title=axis_title("u and valve", operation.u_unit), row=2, col=1)
     figure.update_xaxes(title="time [s]", row=2, col=1)
+    drawn = "The record" if part == operation.rows_of(0) else "The middle of the record"
     caption = (
-        "The middle of the record. Below, the command and the position of the faulty valve that predicts y best: where"
-        " it is the cause, y moves when this valve slips and rests while it rests."
+        f"{drawn}. Below, the command and the position of the faulty valve that predicts y best: where it is the cause,"
+        " y moves when this valve slips and rests while it rests."
     )
     return Section(title="Command, valve and answer", figures=(Figure(figure=figure, caption=caption, height_px=560),))
 

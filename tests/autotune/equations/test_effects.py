@@ -165,3 +165,9 @@ def test_a_recorded_column_acts_at_a_state_at_an_input_and_beside_the_reading() 
     assert equation_of(plant, effect(name, column="w", state="x", gain=1.0)).startswith("d x/dt: + gain*(w")
     with pytest.raises(InputError, match="column"):
         run(effect(name, column="wind", state="x", gain=1.0))
+
+
+def test_what_an_effect_takes_away_has_one_sign() -> None:
+    plant = one_state("u - x", state=[{"name": "x", "kind": "speed", "derivative": "u - x"}])
+    drag = effect("plant.quadratic_drag", state="x", coefficient=1.0)
+    assert equation_of(plant, drag).startswith("d x/dt: - coefficient*x")

@@ -15,11 +15,13 @@ from hypothesis import strategies as st
 from autotune.diagnosis.chain_evidence import ChainEvidence
 from autotune.diagnosis.diagnose import WITHHELD, diagnose
 from autotune.diagnosis.findings import sentences_of
-from autotune.diagnosis.result import Diagnosis
+from autotune.diagnosis.result import Diagnosis, FoundEffect
+from autotune.diagnosis.selection.probability import Candidate
 from autotune.effects import ALL, CATALOGUE, kind_of
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.report.chain_diagram import chain_diagram
 from autotune.report.diagnosis_page import write_diagnosis_page
+from autotune.report.diagnosis_words import how_they_add_up
 from autotune.report.effect_words import clause, join_clauses, number, of_candidate, with_spread
 from autotune.report.investigation_page import list_candidates
 from autotune.report.law_figures import file_names
@@ -46,6 +48,11 @@ def test_a_number_is_the_one_that_was_given_to_its_digits(value: float, digits: 
 def test_a_unit_that_is_none_is_not_written() -> None:
     assert with_spread(Parameter(value=170.4, sd=101.0, unit="-")) == "170.4 ± 198"
     assert with_spread(Parameter(value=0.25, unit="-/s")) == "0.25 1/s"
+
+
+def test_a_number_ends_where_its_interval_does() -> None:
+    assert with_spread(Parameter(value=0.0599823, sd=1.17e-5, unit="kg m^2")) == "0.059982 ± 0.000023 kg m²"
+    assert with_spread(Parameter(value=-17.1523, sd=2.55, unit="V")) == "-17.2 ± 5.0 V"
 
 
 @example(blocks=[("0", "actuator")] * 7, named={key: ["x"] for key in PLACES}, possible=[])
@@ -151,3 +158,12 @@ def test_recordings_of_one_file_name_are_told_apart_by_their_folders() -> None:
     r = servo_recording(1, rows=120)
     assert file_names([replace(r, name="/a/mon/x.csv"), replace(r, name="/a/tue/x.csv")]) == ("mon/x.csv", "tue/x.csv")
     assert file_names([replace(r, name="/a/mon/x.csv"), replace(r, name="/a/mon/y.csv")]) == ("x.csv", "y.csv")
+
+
+@pytest.mark.parametrize(("probability", "said"), [(0.97, "is the sum of those"), (0.82, "but for plant.hard_stop")])
+def test_a_probability_that_parts_made_less_is_not_said_to_be_a_sum(probability: float, said: str) -> None:
+    """Only one part of a recording may have met a stop: the explanations that have it then sum up to more."""
+    effect = FoundEffect(name="plant.hard_stop", probability=probability, places=("plant",), parameters={}, equation="",
+                         windows=())  # fmt: skip
+    candidates = (Candidate(name="plant.hard_stop", probability=0.97), Candidate(name="unknown", probability=0.03))
+    assert said in how_they_add_up((effect,), candidates)

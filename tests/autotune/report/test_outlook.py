@@ -21,9 +21,10 @@ from autotune.models import TransferFunction
 from autotune.pipeline.analysis import Analysis, analyse
 from autotune.points import FrequencyPoint
 from autotune.recording import Recording
+from autotune.report.analysis_sections import analysis_sections
 from autotune.report.outlook import APART, outlook_section, outlook_sentences
 from autotune.report.plant_section import model_figures, numbers_table
-from autotune.report.points_section import frequency_grid
+from autotune.report.points_section import frequency_grid, points_section
 
 SIGNALS = SignalSettings(sample_time_s=0.1, u_unit="%", y_unit="degC")
 
@@ -193,3 +194,28 @@ def test_intervals_of_the_numbers_hold_what_the_region_does(analysis: Analysis) 
         assert middle == pytest.approx(value)
         assert (math.log(high) - math.log(low)) / (2.0 * 1.96 * 0.03) == pytest.approx(1.0, abs=0.25)
     assert rows["dead time [s]"][0] == pytest.approx(8.0)
+
+
+def test_a_page_claims_no_slider_no_band_and_no_second_column_that_are_not_there() -> None:
+    """A lag without dead time, known to a hundred-thousandth: noise alone binds, and no other margin can be had."""
+    facts = LoopFacts(noise_sd=0.05, u_span=20.0, sample_time_s=0.1)
+    lag = TransferFunction(num=(0.8,), den=(90.0, 1.0))
+    known_well = analyse((), DesignSettings(noise_gain=20.0), fit=known(lag, 1e-5), facts=facts)
+    (section,) = outlook_section(known_well, SIGNALS)
+    assert not json.loads(section.figures[0].figure.to_json())["layout"].get("sliders")
+    assert section.figures[0].caption == ""
+    assert "narrower than its line" in section.text[0]
+    assert known_well.source == "fitted plant"
+    loop = next(one for one in analysis_sections(known_well, SIGNALS, None) if one.title == "Controller and margins")
+    assert loop.tables[0].header == ("", "fitted plant")
+
+
+def test_a_point_has_no_more_digits_than_its_interval_tells(analysis: Analysis) -> None:
+    """Of a gain that is known to 14 % three digits are printed, of one known to 0.1 % five."""
+    points = tuple(
+        FrequencyPoint(omega_rad_s=0.1 * k, response=0.089257j, covariance=((var, 0.0), (0.0, var)))
+        for k, var in ((1, (0.14 * 0.089257 / 1.96) ** 2), (2, (0.001 * 0.089257 / 1.96) ** 2))
+    )
+    rows = points_section(replace(analysis, points=points), SIGNALS, None).tables[0].rows
+    assert [row[1] for row in rows] == ["0.0893", "0.089257"]
+    assert [row[2] for row in rows] == ["-270.0", "-270.00"]
