@@ -29,6 +29,8 @@ __all__ = ["Config", "json_schema", "load_config", "validate"]
 
 #: Samples that a sweep has at least.
 LEAST_SAMPLES = 100
+#: Step of a command over its range, below which it is none: converters and registers have 32 bits at most.
+FINEST = 1e-12
 
 
 class Config(Section):
@@ -76,6 +78,12 @@ class Config(Section):
             )
         if not limits.y_min < at.y < limits.y_max:
             raise ValueError(f"operating_point.y = {at.y:g} must lie between limits.y_min and y_max")
+        step, room = self.signals.u_step, limits.u_max - limits.u_min
+        if step and not FINEST * room <= step <= room:
+            raise ValueError(
+                f"signals.u_step = {step:g} is no step of a command between {limits.u_min:g} and {limits.u_max:g}; "
+                "give the converter's, or 0 for any value"
+            )
         return self
 
     @model_validator(mode="after")

@@ -100,7 +100,7 @@ def strip_options(story: Story, span_s: float) -> Options:
     u_lines = [(limits["u_min"], "u_min"), (limits["u_max"], "u_max")] if limits else []
     low, high = (centre - limits["swing"], centre + limits["swing"]) if limits else (0.0, 1.0)
     shown = np.concatenate([y[np.isfinite(y)], [low, high], _near([value for value, _ in y_lines], low, high)])
-    u_range = usual_range(u) if u.size else [0.0, 1.0]
+    u_range = usual_range(u)
     y_line = _line("y", t, y, BLUE, width=1.4) | {
         "markLine": _marks(y_lines, spaced),
         "markArea": SWING | {"data": [[{"yAxis": low}, {"yAxis": high}]]} if limits else {},

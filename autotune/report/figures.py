@@ -191,7 +191,10 @@ def phase_axis(measured: Sequence[FloatArray], drawn: Sequence[FloatArray]) -> t
 
 
 def usual_range(values: FloatArray) -> list[float]:
-    """Return a range that shows the middle 90 % of the values, (N,): an approach from rest would hide a small relay."""
+    """Return a range that shows the middle 90 % of the finite values, (N,); an approach from rest would hide a relay."""
+    values = values[np.isfinite(values)]
+    if not values.size:
+        return [0.0, 1.0]
     low, high = np.quantile(values, [0.05, 0.95])
     room = 0.6 * (high - low) or 1.0
     return [float(low - room), float(high + room)]

@@ -180,6 +180,8 @@ def test_a_permissive_is_part_of_the_rigs_table(tmp_path: Path) -> None:
         ("phases_deg = [-105.0, -160.0]", "phases_deg = [-30.0, -60.0]", r"phases_deg\.0 = -30.*-91"),
         ("phases_deg = [-105.0, -160.0]", "phases_deg = [-105.0, -106.0]", "at least 5 degrees apart"),
         ("sample_time_s = 0.01", "sample_time_s = 1e-308", r"sample_time_s = 1e-308.*1e-6 up to 3600"),
+        ("u_step = 0.00244140625", "u_step = 1e-308", r"u_step = 1e-308 is no step of a command between 0 and 10"),
+        ("u_step = 0.00244140625", "u_step = 11.0", r"u_step = 11 is no step of a command between 0 and 10"),
         ("K = -0.01", "K = 1e300", r"controller\.K = 1e\+300"),
         ('name = "', 'name = "\\u001b[2J', "control character"),
         ('name = "', f'name = "{"x" * 300}', "at most 200 characters"),

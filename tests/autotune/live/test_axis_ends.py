@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autotune.live.axis_ends import linear_ends, log_ends
+from autotune.live.axis_ends import linear_ends, log_ends, phase_ends
+from autotune.report.figures import usual_range
 
 SIZES = st.floats(1e-6, 1e6)
 
@@ -48,3 +49,19 @@ def test_a_range_as_people_draw_it() -> None:
     assert linear_ends(4.25, 5.35) == {"min": 4.2, "max": 5.4, "interval": 0.2}
     flat = linear_ends(5.0, 5.0)
     assert flat["min"] <= 5.0 < flat["max"]
+
+
+@pytest.mark.parametrize("width", [math.inf, math.nan, 1e308, 5e-324])
+def test_a_damaged_number_leaves_the_ends_to_the_chart_or_has_ends_that_are_numbers(width: float) -> None:
+    assert all(math.isfinite(end) for end in linear_ends(-width, width).values())
+    odd = np.array([width, -width, 0.0, 2.0])
+    assert all(math.isfinite(end) for end in phase_ends(odd).values())
+    assert all(math.isfinite(end) for end in log_ends(odd).values())
+    assert usual_range(np.array([width, 1.0, 1.0]))[0] < 1.0
+
+
+def test_what_is_not_finite_is_not_shown() -> None:
+    assert phase_ends(np.array([math.nan, -170.0, -100.0])) == phase_ends(np.array([-170.0, -100.0]))
+    assert log_ends(np.array([math.inf, 0.0, 2.0])) == log_ends(np.array([2.0]))
+    assert usual_range(np.array([math.nan, 4.0, 6.0])) == usual_range(np.array([4.0, 6.0]))
+    assert usual_range(np.array([math.inf])) == [0.0, 1.0]
