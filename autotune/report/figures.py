@@ -191,7 +191,7 @@ def phase_axis(measured: Sequence[FloatArray], drawn: Sequence[FloatArray]) -> t
 
 
 def usual_range(values: FloatArray) -> list[float]:
-    """Return a range that shows the middle 90 % of the finite values, (N,); an approach from rest would hide a relay."""
+    """Return a range that shows the middle 90 % of the finite values, (N,): rest before a small relay would hide it."""
     values = values[np.isfinite(values)]
     if not values.size:
         return [0.0, 1.0]
