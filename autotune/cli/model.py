@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 model_app = typer.Typer(cls=PlainGroup, help="Model files from other tools and for other tools.", no_args_is_help=True)
 app.add_typer(model_app, name="model")
 
-Form = Literal["toml", "text", "latex", "modelica", "python"]
+Form = Literal["toml", "text", "latex", "modelica", "python", "fmu"]
 OUT = Annotated[Path, typer.Option(help="model file to write", metavar="M.toml")]
 
 
@@ -130,12 +130,19 @@ def export(
     """Write a model for another tool, its effects written out as equations."""
     from autotune.equations.exports import as_modelica, as_python, as_text
     from autotune.equations.flatten import flatten
+    from autotune.equations.fmu_export import as_fmu
     from autotune.equations.typeset import as_latex
 
     place = Output(out, inputs=(model,), overwrite=overwrite)
     equations = _equations(model)
     if form == "toml":
         _write(flatten(equations), place)
+        return
+    if form == "fmu":
+        content, library = as_fmu(equations)
+        place.by(lambda part: part.write_bytes(content))
+        built = f"a library for {library}" if library else "no library, as there is no C compiler"
+        typer.echo(f"wrote {out}: FMI 3.0 for co-simulation, its C source and {built}")
         return
     text = {"text": as_text, "latex": as_latex, "modelica": as_modelica, "python": as_python}[form](equations)
     place.text(text)

@@ -1,4 +1,4 @@
-"""Equations for other tools: readable text, Modelica and a Python function.
+"""Equations for other tools: readable text, Modelica, a Python function, and how other languages spell them.
 
 Every export is of the flattened model: effects are written out, so that nothing of this project is needed to run it.
 """
@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import reduce
 
 from autotune.equations.expressions import Call, Expression, Name, Number, to_text
 from autotune.equations.flatten import flatten
@@ -39,7 +41,7 @@ def as_modelica(model: EquationModel) -> str:
     Switched terms stay as they are written: Modelica locates their events itself. Dead times become ``delay(u, d)``.
     """
     flat = flatten(model)
-    names = _safe_names(flat, _MODELICA_WORDS)
+    names = safe_names(flat, _MODELICA_WORDS)
     arrives = {one.column: f"{names[one.column]}_late" if one.delay_s else names[one.column] for one in flat.inputs}
     said = names | arrives
     title = re.sub(r"\W", "_", flat.name).strip("_") or "Rig"
@@ -56,9 +58,9 @@ def as_modelica(model: EquationModel) -> str:
     lines += [f"  output Real y;{_comment(flat.output_unit)}", "equation"]
     lines += [f"  {names[one.column]}_late = delay({names[one.column]}, {one.delay_s!r});"
               for one in flat.inputs if one.delay_s]  # fmt: skip
-    lines += [f"  {names[name]} = {_modelica(tree, said)};" for name, tree in flat.defines]
-    lines += [f"  der({names[one.name]}) = {_modelica(one.derivative, said)};" for one in flat.states]
-    lines += [f"  y = {_modelica(flat.output, said)};", f"end {title};"]
+    lines += [f"  {names[name]} = {_MODELICA.spell(tree, said)};" for name, tree in flat.defines]
+    lines += [f"  der({names[one.name]}) = {_MODELICA.spell(one.derivative, said)};" for one in flat.states]
+    lines += [f"  y = {_MODELICA.spell(flat.output, said)};", f"end {title};"]
     return "\n".join(lines) + "\n"
 
 
@@ -74,8 +76,16 @@ _MODELICA_TAKEN = (
 _MODELICA_WORDS = frozenset(_MODELICA_TAKEN.split())
 
 
-def _safe_names(model: EquationModel, taken: frozenset[str]) -> dict[str, str]:
-    """Return for every name one that the other language lets through."""
+def safe_names(model: EquationModel, taken: frozenset[str]) -> dict[str, str]:
+    """Return for every name of a model one that another language lets through.
+
+    Parameters
+    ----------
+    model : EquationModel
+        Whose inputs, states, parameters and helper expressions are named.
+    taken : frozenset of str
+        What a name there cannot be.
+    """
     names = [*model.columns, *model.state_names, *model.parameter_names, *(name for name, _ in model.defines)]
     found: dict[str, str] = {}
     for name in names:
@@ -86,26 +96,72 @@ def _safe_names(model: EquationModel, taken: frozenset[str]) -> dict[str, str]:
     return found
 
 
-def _modelica(tree: Expression, names: Mapping[str, str]) -> str:
-    match tree:
-        case Number(value):
-            return repr(value) if value >= 0.0 else f"({value!r})"
-        case Name(name):
-            return {"pi": repr(math.pi), "t": "time"}.get(name) or names[name]
-        case Call("neg", (inner,)):
-            return f"(-{_modelica(inner, names)})"
-        case Call("if", (condition, then, otherwise)):
-            a, b, c = (_modelica(one, names) for one in (condition, then, otherwise))
-            return f"(if {a} then {b} else {c})"
-        case Call(("+" | "-" | "*" | "/" | "^" | "<" | "<=" | ">" | ">=") as sign, (left, right)):
-            return f"({_modelica(left, names)} {sign} {_modelica(right, names)})"
-        case Call(("min" | "max") as function, (first, *rest)):
-            nested = _modelica(first, names)
-            for other in rest:
-                nested = f"{function}({nested}, {_modelica(other, names)})"
-            return nested
-    assert isinstance(tree, Call)
-    return f"{tree.function}({', '.join(_modelica(one, names) for one in tree.arguments)})"
+@dataclass(frozen=True, kw_only=True)
+class Language:
+    """How another language spells what an expression says.
+
+    Attributes
+    ----------
+    constants : mapping of str to str
+        Its names of pi and of the time.
+    conditional, power : str
+        Its forms, with ``{condition} {then} {otherwise}`` and ``{base} {exponent}``.
+    functions : mapping of str to str
+        Names of its functions, where they differ from the expression's.
+    prefix : str
+        What stands before the name of any other function.
+    """
+
+    constants: Mapping[str, str]
+    conditional: str
+    power: str
+    functions: Mapping[str, str] = field(default_factory=dict)
+    prefix: str = ""
+
+    def spell(self, tree: Expression, names: Mapping[str, str]) -> str:
+        """Return an expression in this language.
+
+        Parameters
+        ----------
+        tree : Expression
+            What is spelled.
+        names : mapping of str to str
+            The names that this language lets through, of the model's own.
+        """
+        match tree:
+            case Number(value):
+                return repr(value) if value >= 0.0 else f"({value!r})"
+            case Name(name):
+                return self.constants.get(name) or names[name]
+        assert isinstance(tree, Call)
+        said = [self.spell(one, names) for one in tree.arguments]
+        match tree.function:
+            case "neg":
+                return f"(-{said[0]})"
+            case "if":
+                return self.conditional.format(condition=said[0], then=said[1], otherwise=said[2])
+            case "^":
+                return self.power.format(base=said[0], exponent=said[1])
+            case "+" | "-" | "*" | "/" | "<" | "<=" | ">" | ">=" as sign:
+                return f"({said[0]} {sign} {said[1]})"
+            case "min" | "max" as function:
+                name = self.functions.get(function, function)
+                return reduce(lambda nested, other: f"{name}({nested}, {other})", said)
+        return f"{self.functions.get(tree.function, self.prefix + tree.function)}({', '.join(said)})"
+
+
+_MODELICA = Language(
+    constants={"pi": repr(math.pi), "t": "time"},
+    conditional="(if {condition} then {then} else {otherwise})",
+    power="({base} ^ {exponent})",
+)
+_PYTHON = Language(
+    constants={"pi": "math.pi", "t": "t"},
+    conditional="({then} if {condition} else {otherwise})",
+    power="({base} ** {exponent})",
+    functions={"min": "min", "max": "max", "abs": "abs", "sign": "_sign"},
+    prefix="math.",
+)
 
 
 def as_python(model: EquationModel) -> str:
@@ -115,12 +171,12 @@ def as_python(model: EquationModel) -> str:
     ``INPUTS`` (those of ``DELAYS`` that many seconds ago), ``p`` a mapping, by default ``PARAMETERS``.
     """
     flat = flatten(model)
-    names = _safe_names(flat, _PYTHON_WORDS)
+    names = safe_names(flat, _PYTHON_WORDS)
     unpack = [f"    {', '.join(names[s] for s in flat.state_names)}, = x"]
     unpack += [f"    {', '.join(names[c] for c in flat.columns)}, = inputs"]
     unpack += [f"    {names[p]} = p[{p!r}]" for p in flat.parameter_names]
-    unpack += [f"    {names[name]} = {_python(tree, names)}" for name, tree in flat.defines]
-    slopes = [f"        {_python(one.derivative, names)}," for one in flat.states]
+    unpack += [f"    {names[name]} = {_PYTHON.spell(tree, names)}" for name, tree in flat.defines]
+    slopes = [f"        {_PYTHON.spell(one.derivative, names)}," for one in flat.states]
     lines = [
         f'"""{flat.name}: dx/dt = derivatives(t, x, inputs), y = output(t, x, inputs)."""', "", "import math", "",
         f"STATES = {flat.state_names!r}", f"INPUTS = {flat.columns!r}",
@@ -128,7 +184,7 @@ def as_python(model: EquationModel) -> str:
         f"PARAMETERS = {({p.name: p.value for p in flat.parameters})!r}", "", "",
         "def _sign(value):", "    return (value > 0) - (value < 0)", "", "",
         "def derivatives(t, x, inputs, p=PARAMETERS):", *unpack, "    return [", *slopes, "    ]", "", "",
-        "def output(t, x, inputs, p=PARAMETERS):", *unpack, f"    return {_python(flat.output, names)}",
+        "def output(t, x, inputs, p=PARAMETERS):", *unpack, f"    return {_PYTHON.spell(flat.output, names)}",
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
 
@@ -139,23 +195,3 @@ _PYTHON_TAKEN = (
     "output min max abs _sign STATES INPUTS DELAYS PARAMETERS "
 )
 _PYTHON_WORDS = frozenset(_PYTHON_TAKEN.split())
-
-
-def _python(tree: Expression, names: Mapping[str, str]) -> str:
-    match tree:
-        case Number(value):
-            return repr(value) if value >= 0.0 else f"({value!r})"
-        case Name(name):
-            return {"pi": "math.pi", "t": "t"}.get(name) or names[name]
-        case Call("neg", (inner,)):
-            return f"(-{_python(inner, names)})"
-        case Call("if", (condition, then, otherwise)):
-            a, b, c = (_python(one, names) for one in (condition, then, otherwise))
-            return f"({b} if {a} else {c})"
-        case Call("^", (base, exponent)):
-            return f"({_python(base, names)} ** {_python(exponent, names)})"
-        case Call(("+" | "-" | "*" | "/" | "<" | "<=" | ">" | ">=") as sign, (left, right)):
-            return f"({_python(left, names)} {sign} {_python(right, names)})"
-    assert isinstance(tree, Call)
-    function = {"min": "min", "max": "max", "abs": "abs", "sign": "_sign"}.get(tree.function, f"math.{tree.function}")
-    return f"{function}({', '.join(_python(one, names) for one in tree.arguments)})"

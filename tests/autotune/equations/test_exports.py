@@ -9,11 +9,16 @@ from pathlib import Path
 from types import MappingProxyType
 
 import control
+import fmpy
 import numpy as np
 import pytest
+from fmpy.validation import validate_fmu
 from scipy.integrate import solve_ivp
+from typer.testing import CliRunner
 
+from autotune.cli import app
 from autotune.equations import Drive, EquationModel, apply, compile_model, read_equations, simulate, write_equations
+from autotune.equations.black_box import BlackBox
 from autotune.equations.chain import from_chain
 from autotune.equations.exports import as_modelica, as_python, as_text
 from autotune.equations.files import read_any_model
@@ -168,6 +173,38 @@ def test_a_chain_may_have_a_measured_disturbance(tmp_path: Path) -> None:
     assert found.columns == ("u", "door")
     both = np.column_stack([np.full(T.size, 0.2), np.ones(T.size)])
     np.testing.assert_allclose(y_of(found, T, both), 50.0 - 3.0 * (1.0 - np.exp(-T / 2.0)), atol=1e-6)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None and shutil.which("gcc") is None, reason="no C compiler: apt install gcc")
+@pytest.mark.parametrize("which", ["equations with effects", "a chain with dead time"])
+def test_an_exported_fmu_is_valid_and_runs_as_the_model_does(tmp_path: Path, which: str) -> None:
+    """Dead times need not be multiples of the communication step: what arrives within one is met there."""
+    if which == "equations with effects":
+        write_equations(EXTENDED, tmp_path / "m.toml")
+        exported, tuned = EXTENDED, "J"
+    else:
+        (tmp_path / "m.toml").write_text(CHAIN)
+        exported = from_chain(read_model(tmp_path / "m.toml"))
+        tuned = exported.parameters[0].name
+    command = ["model", "export", str(tmp_path / "m.toml"), "--form", "fmu", "--out", str(tmp_path / "rig.fmu")]
+    said = CliRunner().invoke(app, command)
+    assert said.exit_code == 0, said.output
+    assert f"a library for {fmpy.platform_tuple}" in said.output
+    assert validate_fmu(tmp_path / "rig.fmu") == []
+    back = tmp_path / "back.toml"
+    assert CliRunner().invoke(app, ["model", "from-fmu", str(tmp_path / "rig.fmu"), "--out", str(back)]).exit_code == 0
+    box = read_any_model(back)
+    assert isinstance(box, BlackBox)
+    values, drive = {p.name: p.value for p in box.parameters}, Drive(t=T, inputs=U[:, None])
+    wanted = y_of(exported)
+    np.testing.assert_allclose(box.simulation(values, drive), wanted, atol=1e-5 * np.ptp(wanted))
+    other = replace(
+        exported,
+        parameters=tuple(replace(p, value=1.5 * p.value) if p.name == tuned else p for p in exported.parameters),
+    )
+    retuned = box.simulation(values | {tuned: 1.5 * values[tuned]}, drive)
+    np.testing.assert_allclose(retuned, y_of(other), atol=1e-5 * np.ptp(wanted))
+    assert not np.allclose(retuned, wanted, atol=1e-3 * np.ptp(wanted))
 
 
 def test_a_linearisation_is_the_tangent() -> None:
