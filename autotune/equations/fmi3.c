@@ -77,7 +77,7 @@ static Status integrate(Model *m, double end, const double *in)
         {35.0 / 384, 0, 500.0 / 1113, 125.0 / 192, -2187.0 / 6784, 11.0 / 84}};
     static const double C[7] = {0, 0.2, 0.3, 0.8, 8.0 / 9, 1, 1};
     static const double WRONG[7] = {71.0 / 57600, 0, -71.0 / 16695, 71.0 / 1920, -17253.0 / 339200, 22.0 / 525, -1.0 / 40};
-    double k[7][STATES + 1], x[STATES + 1], h = end - m->t, least = 1e-5 * h;
+    double k[7][STATES + 1], x[STATES + 1], h = end - m->t, least = 1e-4 * h;
     while (m->t < end) {
         if (h > end - m->t) h = end - m->t;
         for (int s = 0; s < 7; s++) {

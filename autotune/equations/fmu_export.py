@@ -131,7 +131,7 @@ def as_fmu(model: EquationModel) -> tuple[bytes, str]:
 
     Notes
     -----
-    Terms that switch are stepped over with a hundred-thousandth of a communication step at the shortest, where the
+    Terms that switch are stepped over with a ten-thousandth of a communication step at the shortest, where the
     project's own simulation locates them.
 
     References
