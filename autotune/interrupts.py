@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
 from types import FrameType
 
 #: where an exception is lost: compiled code that calls Python to make its result, and a module that is half imported
@@ -89,6 +88,8 @@ def interrupt_held() -> Iterator[None]:
     A terminal sends Ctrl-C to every process of a command, those included that are still importing and would each print
     a traceback. A signal that is blocked where a process is started is blocked in it from its first instruction on.
     """
+    from multiprocessing import resource_tracker
+
     if not hasattr(signal, "pthread_sigmask") or threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -10,12 +10,10 @@ import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
-from packaging.requirements import Requirement
 from rich.console import Console
 
 from autotune.cli import app
@@ -23,6 +21,8 @@ from autotune.cli.common import count_compiled, warn_of_no_dead_man
 from autotune.errors import InputError
 
 if TYPE_CHECKING:
+    from packaging.requirements import Requirement
+
     from autotune.config import Config
 
 DISTRIBUTION = "relay-autotune"
@@ -101,6 +101,10 @@ def _python() -> Check:
 
 def _packages() -> Iterator[Check]:
     """Compare what is installed with what the project asks for."""
+    from importlib import metadata
+
+    from packaging.requirements import Requirement
+
     try:
         asked = [Requirement(line) for line in metadata.requires(DISTRIBUTION) or []]
     except metadata.PackageNotFoundError:
@@ -117,6 +121,8 @@ def _packages() -> Iterator[Check]:
 
 
 def _missing(asked: Requirement) -> str:
+    from importlib import metadata
+
     try:
         version = metadata.version(asked.name)
     except metadata.PackageNotFoundError:
@@ -125,6 +131,10 @@ def _missing(asked: Requirement) -> str:
 
 
 def _extra() -> Check:
+    from importlib import metadata
+
+    from packaging.requirements import Requirement
+
     if _missing(Requirement("nicegui")):
         remedy = f"pip install '{DISTRIBUTION}[live]' for run --live"
         return Check(subject="live page", found="not installed", verdict="note", remedy=remedy)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 
 from autotune.cli import app
@@ -71,6 +70,8 @@ def _prove_simulated(
     out: Path, seeds: range, ties: int, workers: int, ablation: tuple[str, int], scheduler: str | None
 ) -> None:
     """Prove on simulated recordings; ``ablation`` is the entry left out and the most cases of it."""
+    from rich.progress import track
+
     from sim.proof import Campaign, conceal, keep_failures, mark_all, seal
     from sim.score import resolved, table
 

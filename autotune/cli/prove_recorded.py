@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import track
 
 from autotune.cli.proof_steps import diagnose_all, print_confusion, print_table, publish
 from autotune.errors import InputError
@@ -42,6 +41,8 @@ def prove_recorded(folder: Path, out: Path, cases: int | None, seed: int, worker
     InputError
         No rig can be used; the campaign was begun with others; an answer changed after it was sealed.
     """
+    from rich.progress import track
+
     from sim.proof import seal
     from sim.recorded.campaign import conceal, mark_all, open_campaign
     from sim.recorded.rigs import RefusedError

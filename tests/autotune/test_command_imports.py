@@ -32,8 +32,12 @@ def imported(packages: str, *call: str | Path) -> str:
     return ended.stdout.splitlines()[-1]
 
 
-def test_help_imports_no_package_of_the_method() -> None:
-    assert imported(f"{OF_OTHERS},{OF_THE_METHOD}", "--help") == "imported:"
+#: of single commands: doctor's look at what is installed, the start of processes
+OF_A_COMMAND = "packaging,importlib.metadata,multiprocessing"
+
+
+def test_help_imports_no_package_of_the_method_and_none_of_a_single_command() -> None:
+    assert imported(f"{OF_OTHERS},{OF_THE_METHOD},{OF_A_COMMAND}", "--help") == "imported:"
 
 
 def test_tune_imports_no_package_of_a_rig_or_of_an_extra(tmp_path: Path) -> None:
