@@ -13,6 +13,9 @@ from autotune.identification.noise_colour import WHITE, whitening_filter
 #: Part of y that may be missing or wild before the record is refused.
 _LARGEST_BAD_PART = 0.05
 _OUTLIER_SD = 8.0
+#: Part of the slope beside a sample by which a curve may miss it. Any part below 1 tells a pair of spikes from a turn:
+#: the first would have to be both less than the second and more.
+_TURN = 0.8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,8 +61,9 @@ def clean_measurement(t: FloatArray, y: FloatArray, name: str) -> tuple[FloatArr
     Notes
     -----
     Wild is a sample that lies eight robust standard deviations outside what the middle two of its four nearest
-    neighbours span. One spike or two in a row do; the corner at which a fast plant begins to answer a step does not,
-    however little noise there is.
+    neighbours span, and not where the neighbours lead to: both sides to a peak, either to what lies between them. One
+    spike or two in a row do; the corner at which a fast plant begins to answer a step, and the peak at which its
+    command turns it round, do not, however little noise there is.
     """
     good = np.isfinite(y)
     filled = np.interp(t, t[good], y[good]) if good.sum() > 8 else y
@@ -83,7 +87,14 @@ def _wild(y: FloatArray) -> BoolArray:
     inner = y[2:-2]
     scale = 1.4826 * float(np.median(np.abs(inner - 0.5 * (low + high))))
     outside = np.maximum(low - inner, inner - high)
-    wild[2:-2] = (outside > _OUTLIER_SD * scale) & (scale > 0.0)
+    slopes = np.stack([y[1:-3] - y[:-4], y[3:-1] - y[4:]])  # of either side, towards the sample
+    off = np.abs(inner - np.stack([y[1:-3], y[3:-1]]) - slopes)
+    led_to = off <= np.maximum(_OUTLIER_SD * scale, _TURN * np.abs(slopes))
+    between = (inner - y[1:-3]) * (y[3:-1] - inner) > 0.0
+    steep = np.max(np.abs(slopes), axis=0)
+    turns = np.max(off, axis=0) <= np.maximum(_OUTLIER_SD * scale, _TURN * steep)
+    turns |= between & np.any(led_to, axis=0)
+    wild[2:-2] = (outside > _OUTLIER_SD * scale) & (scale > 0.0) & ~turns
     return wild
 
 
