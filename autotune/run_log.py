@@ -59,7 +59,11 @@ class RunLog:
     def begin(self, config: Config) -> None:
         """Say what is commissioned."""
         self._write(
-            "run", config=config.model_dump(mode="json", include={"name", "signals", "limits", "operating_point"})
+            "run",
+            config=config.model_dump(
+                mode="json",
+                include={"name": True, "signals": True, "limits": True, "operating_point": True, "rig": {"kind"}},
+            ),
         )
 
     def recording(self, path: Path) -> Path:

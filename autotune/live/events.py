@@ -59,10 +59,17 @@ class Centre(_Part):
     y: Number
 
 
+class RigKind(_Part):
+    """What kind of rig it is; empty where nothing says."""
+
+    kind: Words = ""
+
+
 class Told(_Part):
     """The configuration as far as an onlooker needs it."""
 
     name: Words
+    rig: RigKind = RigKind()
     signals: Signals
     limits: Limits
     operating_point: Centre

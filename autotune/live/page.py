@@ -270,7 +270,7 @@ class Screen:
 
     def _show_outcome(self) -> None:
         story = self._story
-        self._verdict.text = _decision(story)
+        self._verdict.text = story.outcome_text()
         self._steps.set_visibility(bool(story.steps))
         self._steps_note.set_visibility(bool(story.steps))
         self._choice.set_visibility(story.waiting_s > 0.0 and self._controls.act is not None)
@@ -329,17 +329,6 @@ class Heading(TextElement):
 
     def __init__(self) -> None:
         super().__init__(tag="h1", text="")
-
-
-def _decision(story: Story) -> str:
-    tried = f"Accepted: {story.verdict}." if story.accepted else f"Not accepted: {story.verdict}."
-    if not story.verdict:
-        tried = "Designed, not tried on the rig."
-    if story.gains is None:
-        return tried
-    if story.gains.old is None:
-        return f"{tried} The rig has no controller of its own: the gains are in result.json."
-    return f"{tried} The rig holds the {'new' if story.gains.deployed else 'old'} gains."
 
 
 def _gain_rows(story: Story) -> list[tuple[str, str, str]]:

@@ -302,6 +302,18 @@ class Story:
             f" within {limits['swing']:g} {y_unit} of {self.centre:g} {y_unit} (shaded); {limits['time_s']:g} s in all"
         )
 
+    def outcome_text(self) -> str:
+        """Return what came of the new gains: how they were tried, and which ones the rig holds."""
+        tried = f"{'Accepted' if self.accepted else 'Not accepted'}: {self.verdict}."
+        if not self.verdict:
+            tried = "Designed, not tried on the rig."
+        if self.gains is None:
+            return tried
+        if self.gains.old is None:
+            return f"{tried} The rig has no controller of its own: the gains are in result.json."
+        simulated = "simulated " if self.config is not None and self.config.rig.kind == "simulated" else ""
+        return f"{tried} The {simulated}rig holds the {'new' if self.gains.deployed else 'old'} gains."
+
     def warnings(self) -> list[str]:
         """Return what an onlooker should know, in words."""
         found = list(self._told)

@@ -160,7 +160,11 @@ def _equations(found: Diagnosis) -> tuple[Section, ...]:
         formulas, lines = as_mathml(model), as_text(model).split("\n\n")[-1].splitlines()
     except InputError:
         formulas, lines = (), ["Effects on samples are listed in extended_model.toml."]
-    return (Section(title="The model to go on with", formulas=formulas, text=tuple(line for line in lines if line)),)
+    return (
+        Section(
+            title="The model to go on with", formulas=formulas, text=tuple(typeset_unit(line) for line in lines if line)
+        ),
+    )
 
 
 def _share(error: float) -> str:

@@ -181,7 +181,7 @@ def test_gains_that_are_not_wanted_are_taken_back_from_the_rig(opened: Callable[
         with closing(opened(live.url).context) as context:
             (page,) = context.pages
             page.get_by_role("button", name="Restore old gains").click(timeout=LIMIT_MS)
-            expect(page.locator(".outcome")).to_contain_text("The rig holds the old gains.", timeout=LIMIT_MS)
+            expect(page.locator(".outcome")).to_contain_text("The simulated rig holds the old gains.", timeout=LIMIT_MS)
         tuning = run.result()
     assert tuning.verification is not None
     assert tuning.verification.accepted

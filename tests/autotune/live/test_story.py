@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from autotune.controller import PIDController
 from autotune.errors import ExperimentStopped
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import State, Status
@@ -56,6 +57,17 @@ def test_recordings_of_one_run_lie_one_after_the_other_in_time(tmp_path: Path) -
     story.poll()
     assert list(story.rows.t) == [0.0, 7.0, 7.0, 9.0]
     assert list(story.rows.r) == [5.0, 5.0, 6.0, 6.0]  # the operating point is the set-point until another is given
+
+
+def test_the_outcome_says_whose_rig_holds_the_gains(tmp_path: Path) -> None:
+    """As the run's own verdict does: of a simulated rig no real one was touched."""
+    before, new = PIDController(K=-0.01, Ti_s=6.0), PIDController(K=-0.03, Ti_s=3.5)
+    with RunLog(tmp_path / "progress.jsonl") as log:
+        log.begin(ball_config())
+        log.gains(before, new, deployed=True)
+    story = Story(tmp_path)
+    story.poll()
+    assert story.outcome_text() == "Designed, not tried on the rig. The simulated rig holds the new gains."
 
 
 def test_the_time_left_runs_down_with_the_rows(tmp_path: Path) -> None:
