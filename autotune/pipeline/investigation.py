@@ -243,8 +243,8 @@ def _next(
     plan = plan_in(found, conditions_of(config), duration_s, seed=done + 1, progress=report)
     if plan is None or plan.discrimination < found.search.data.thresholds.beyond_chance:
         told = 0.0 if plan is None else plan.discrimination
-        names = " and ".join("nothing more" if name == "none" else name for name in hypotheses)
-        return None, f"no experiment within the limits tells {names} apart (expected chi-square {told:.2g})"
+        names = ", ".join("nothing else is missing" if name == "none" else name for name in hypotheses)
+        return None, f"no experiment within the limits tells these apart (expected chi-square {told:.2g}): {names}"
     return plan, ""
 
 
