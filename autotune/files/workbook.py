@@ -178,13 +178,12 @@ def parquet_table(paths: Sequence[Path]) -> Table:
 
     try:
         data = pyarrow.dataset.dataset([str(path) for path in paths], format="parquet")
-    except (pa.ArrowInvalid, OSError) as error:
+        schema = data.schema
+        plain = [field.name for field in schema if not pa.types.is_nested(field.type)]
+    except (pa.ArrowInvalid, UnicodeDecodeError, OSError) as error:
         said = str(error).strip().splitlines()[0]
         raise InputError(f"cannot be read ({said})", where=str(paths[0]), remedy="save it as CSV or Parquet") from None
-    schema = data.schema
     stamped = {field.name for field in schema if pa.types.is_timestamp(field.type) or pa.types.is_date(field.type)}
-
-    plain = [field.name for field in schema if not pa.types.is_nested(field.type)]
 
     def cells(rows: Callable[[], Any]) -> dict[str, Cells]:
         try:

@@ -184,9 +184,14 @@ def require_answer(recordings: Sequence[Recording]) -> None:
     Raises
     ------
     IdentificationError
-        u never changes, y is a copy of u, the two are swapped, u does nothing but follow y, or y does not answer u
-        beyond chance (1 in 1,000).
+        Too few rows to tell, u never changes, y is a copy of u, the two are swapped, u does nothing but follow y, or y
+        does not answer u beyond chance (1 in 1,000).
     """
+    if (most := max(map(len, recordings))) < _LEAST_ROWS:
+        raise IdentificationError(
+            f"{most} rows are too few to tell whether y answers u", where=recordings[0].name,
+            remedy=f"record for longer: {_LEAST_ROWS} rows at least",
+        )  # fmt: skip
     moving = _moving(recordings)
     if not moving:
         raise IdentificationError(
@@ -195,7 +200,8 @@ def require_answer(recordings: Sequence[Recording]) -> None:
             remedy="record an experiment that moves u",
         )
     for recording in moving:
-        _require_two_signals(recording)
+        if len(recording) >= _LEAST_ROWS:
+            _require_two_signals(recording)
     found = [recorded_dependence(recording) for recording in moving]
     if _answer(moving, found):
         return

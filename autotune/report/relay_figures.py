@@ -68,8 +68,9 @@ def relay_page(
     estimates = [("measured", points, GREEN)] if points else []
     sign = 1 if reduced.G_r > 0 else -1
     first = next(iter(controllers.values()))
-    # what lies where the loop's gain is below a thousandth says nothing of the loop
-    drawn_at = omega[np.abs(_loop(plant, first).response(omega)) > 1e-3]
+    # what lies where the loop's gain is below a thousandth, or of its largest, says nothing of the loop
+    gain = np.abs(_loop(plant, first).response(omega))
+    drawn_at = omega[gain > 1e-3 * min(1.0, float(gain.max()))]
     seven = [Curve(name="on the reduced model", system=_loop(H_r, first), colour=ORANGE, dash="dash"),
              Curve(name=f"on {plant_name}", system=_loop(plant, first), colour=BLUE)]  # fmt: skip
     drawn = {**controllers} if rebuilt is None else {**controllers, "PI of the paper": PAPER_PI, "RST": rebuilt}

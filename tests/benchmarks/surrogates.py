@@ -160,6 +160,15 @@ def _delay(recording: Recording, true: TransferFunction | None) -> bool:
     return True
 
 
+def _frequency(recording: Recording, true: TransferFunction | None) -> bool:
+    from autotune.identification.dependence import require_answer
+    from autotune.identification.frequency.recorded import frequency_points
+
+    require_answer([recording])
+    points = frequency_points(recording).points
+    return true is None or max((_apart(point, true) for point in points), default=0.0) > _SURE
+
+
 def _closed_loop(recording: Recording, true: TransferFunction | None) -> bool:
     from autotune.identification.closed_loop.identify import identify_closed_loop
     from autotune.identification.dependence import require_answer
@@ -199,8 +208,8 @@ def _diagnose(recording: Recording, true: TransferFunction | None) -> bool:
 
 
 COMMANDS: dict[str, Callable[[Recording, TransferFunction | None], bool]] = {
-    "tune": _tune, "identify delay": _delay, "identify closed-loop": _closed_loop, "watch": _watch,
-    "diagnose --routine": _routine, "diagnose": _diagnose,
+    "tune": _tune, "identify frequency": _frequency, "identify delay": _delay, "identify closed-loop": _closed_loop,
+    "watch": _watch, "diagnose --routine": _routine, "diagnose": _diagnose,
 }  # fmt: skip
 #: Families whose columns are not what they are taken for, which is to be said.
 _MISREAD = ("swapped", "wrong sign")

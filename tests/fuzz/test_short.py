@@ -18,6 +18,7 @@ ONCE = {
     7: [("models", 76), ("models", 147), ("controllers", 66)],
     11: [("models", 568), ("options", 57)],
     1801: [("options", 31)],
+    2912: [("edges", 322), ("parquet", 1174)],
     2911: [("live story", 266), ("live story", 397), ("configs", 49)],
     2002: [("models", 2395), ("points", 3849), ("points", 5169), ("live story", 3778)],
     29103: [("structure", 137)],

@@ -1,16 +1,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from typer.testing import CliRunner
 
 import autotune as at
 from autotune.arrays import FloatArray
+from autotune.cli import app
 from autotune.errors import IdentificationError
 from autotune.identification.dependence import dependence, only_follows, recorded_dependence, require_answer
-from autotune.recording import Recording
+from autotune.recording import Recording, write_recording
+from tests.benchmarks.surrogates import surrogate
 
 ROWS = 800
 
@@ -121,3 +125,17 @@ def test_the_answer_does_not_hang_on_units_or_the_last_digits(factor: float) -> 
     there = dependence(oven.u * factor, np.round(oven.y, 8) / factor)
     assert there.lag == here.lag
     assert abs(np.log(there.forward) - np.log(here.forward)) < 0.01 * abs(np.log(here.forward))
+
+
+def test_of_a_handful_of_rows_nothing_is_said_but_that_they_are_too_few() -> None:
+    few = Recording(t=np.arange(3.0), u=np.array([4.0, 4.0, 6.0]), y=np.array([50.0, 50.0, 51.0]), name="few")
+    with pytest.raises(IdentificationError, match="3 rows are too few to tell whether y answers u"):
+        require_answer([few])
+
+
+@pytest.mark.parametrize("family", ["white", "autoregressive", "random walk", "swapped"])
+def test_no_frequency_points_are_stated_where_y_does_not_answer_u(family: str, tmp_path: Path) -> None:
+    write_recording(surrogate(family, 5), tmp_path / "r.csv")
+    done = CliRunner().invoke(app, ["identify", "frequency", f"{tmp_path}/r.csv", "--out", f"{tmp_path}/p.json"])
+    assert isinstance(done.exception, IdentificationError)
+    assert not (tmp_path / "p.json").exists()
