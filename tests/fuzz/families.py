@@ -160,7 +160,7 @@ def stories(rng: random.Random, folder: Path) -> Call:
 
     def show() -> object:
         from autotune.live.charts import Pictures
-        from autotune.live.page import _decision, _gain_rows
+        from autotune.live.page import _gain_rows
         from autotune.live.story import Story
 
         story = Story(folder)
@@ -168,7 +168,7 @@ def stories(rng: random.Random, folder: Path) -> Call:
         pictures = Pictures(story)
         drawn = json.dumps([pictures.strip(60.0), pictures.strip(float("inf")), pictures.facts()], default=repr)
         said = (story.relay_text(), story.limits_text(), story.warnings(), story.remaining_s, story.decision_s)
-        return drawn, said, _decision(story), _gain_rows(story)
+        return drawn, said, story.outcome_text(), _gain_rows(story)
 
     return show
 
