@@ -259,7 +259,8 @@ def run(
     past = 0
     for window in range(rows.shape[1]):
         first, last = rows[0, window], rows[1, window]
-        x[:] = states[0, window]
+        for i in range(n):  # entry by entry: an assigned slice is compiled with the text of its error, for seconds
+            x[i] = states[0, window, i]
         # the command in force at the window's start, dead time counted, and when the next one arrives
         j = first
         while j > 0 and _arrival(t, j, linear, effects) > t[first] + 1e-9:
@@ -308,7 +309,8 @@ def run(
                     w = u[j] - u_offset
                     for _ in range(pieces):
                         _advance(M, slot, x, w, free)
-                        x[:] = free
+                        for i in range(n):
+                            x[i] = free[i]
                     now = until
                     continue
                 if flags[DRY]:
@@ -324,9 +326,11 @@ def run(
                     _advance(M, use, x, w, free)
                     if flags[FORCED]:
                         _push(use, w, begin_s - t[0], dt, linear, work, effects)
-                    x[:] = free
+                    for i in range(n):
+                        x[i] = free[i]
                     if flags[STOPPED]:
                         _stop(x, linear, effects)
                 now = until
-        states[1, window] = x
+        for i in range(n):
+            states[1, window, i] = x[i]
     return out
