@@ -96,3 +96,9 @@ def deviations_beside_prior(J: FloatArray) -> FloatArray:
     R = np.linalg.qr(np.vstack([J, np.eye(J.shape[1])]), mode="r")
     rows = np.linalg.solve(R, np.eye(J.shape[1]))  # its factors are I and R: substitution alone
     return np.asarray(np.linalg.norm(rows, axis=1))
+
+
+def smallest_step(signal: FloatArray) -> float:
+    """Return the smallest difference between values (N,) of a signal, below 1e-6 of its range none; 0 of one value."""
+    apart = np.diff(np.unique(signal))
+    return float(np.min(apart, where=apart > 1e-6 * np.ptp(signal), initial=np.inf)) if apart.size else 0.0

@@ -13,7 +13,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 from scipy.signal import cont2discrete, lfilter
 
-from autotune.arrays import FloatArray
+from autotune.arrays import FloatArray, smallest_step
 from autotune.controller import Controller, DiscreteController, PIDController
 from autotune.errors import InputError
 from autotune.models import TransferFunction
@@ -103,7 +103,7 @@ def check_law(
     """
     own = u - (np.zeros_like(u) if added is None else added)
     reference = np.zeros_like(u) if r is None else r
-    rows, step = _rows_within_extremes(u), _resolution(u)
+    rows, step = _rows_within_extremes(u), smallest_step(u)
     checks = []
     for law in _discrete_laws(controller, sample_time_s):
         for late in (0, 1):  # computed from this row's measurement, or from the one before
@@ -190,9 +190,3 @@ def _rows_within_extremes(u: FloatArray) -> FloatArray:
         if 0.01 * len(u) < at.sum() < 0.9 * len(u):
             keep[at] = 0.0
     return keep
-
-
-def _resolution(signal: FloatArray) -> float:
-    """Return the smallest difference between the values (N,) of a signal; below a millionth of its range it is none."""
-    apart = np.diff(np.unique(signal))
-    return float(np.min(apart, where=apart > 1e-6 * np.ptp(signal), initial=np.inf)) if apart.size else 0.0

@@ -61,6 +61,7 @@ def local_estimate(
     centre_rad_s: float,
     *,
     excited: BoolArray | None = None,
+    common: float = 0.0,
 ) -> LocalEstimate | None:
     """Fit the local polynomials to one window of lines.
 
@@ -76,6 +77,8 @@ def local_estimate(
         Where the gain is wanted [rad/s], within the window.
     excited : (n,) array, optional
         Lines that carry excitation; all when absent. Fewer than three carry fewer terms of G.
+    common : float
+        Power on each line of the first output, weighted, that goes with the regressor and is in no residual: rounding.
 
     Returns
     -------
@@ -97,10 +100,12 @@ def local_estimate(
         return None
     found = _fit(omega_rad_s, regressor, Z, centre_rad_s, min(lines, 3))
     finer = _fit(omega_rad_s, regressor, Z, centre_rad_s, 4) if lines >= 4 else None
-    if found is None or finer is None:
-        return found
-    bias = found.gain - finer.gain
-    return replace(found, covariance=found.covariance + np.outer(bias, bias.conj()))
+    if found is None:
+        return None
+    bias = found.gain - finer.gain if finer is not None else np.zeros_like(found.gain)
+    covariance = found.covariance + np.outer(bias, bias.conj())
+    covariance[0, 0] += common / float(np.mean(np.abs(regressor) ** 2))
+    return replace(found, covariance=covariance)
 
 
 def _fit(

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from autotune.arrays import FloatArray
 from autotune.distributions import chi2_tail
 from autotune.errors import IdentificationError
 from autotune.identification.frequency.excitation import relay_segments
@@ -73,7 +74,7 @@ def frequency_points(recording: Recording, *, largest_relative_sd: float = 0.5) 
     Raises
     ------
     IdentificationError
-        The command never changes, too few rows, a broken measurement, or nothing above the noise.
+        The command or y never changes, too few rows, a broken measurement, or nothing above the noise.
 
     Notes
     -----
@@ -82,16 +83,19 @@ def frequency_points(recording: Recording, *, largest_relative_sd: float = 0.5) 
     into u is correlated with u and would bias y over u towards -1/C; it is not correlated with r.
     """
     recording.require_finite(("u",))
-    if np.ptp(recording.u) <= 1e-12 * max(float(np.max(np.abs(recording.u))), 1e-300):
-        raise IdentificationError(
-            "the command never changes", where=recording.name, remedy="record an experiment that moves u"
-        )
+    _require_moving(recording.u, "the command", recording.name)
+    _require_moving(recording.y[np.isfinite(recording.y)], "y", recording.name)
     segments = relay_segments(recording)
     if sum(end - start for start, end in segments) >= _RELAY_PART * recording.duration_s or (
         segments and "relay" in recording.metadata
     ):
         return _of_relay(recording, segments, largest_relative_sd)
     return points_of_spectra(recording, largest_relative_sd)
+
+
+def _require_moving(values: FloatArray, what: str, name: str) -> None:
+    if not values.size or np.ptp(values) <= 1e-12 * max(float(np.max(np.abs(values))), 1e-300):
+        raise IdentificationError(f"{what} never changes", where=name, remedy="record an experiment that moves u and y")
 
 
 def _of_relay(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from autotune.arrays import BoolArray, ComplexArray, FloatArray
+from autotune.arrays import BoolArray, ComplexArray, FloatArray, smallest_step
 from autotune.errors import IdentificationError
 from autotune.identification.noise_colour import WHITE, whitening_filter
 
@@ -34,6 +34,8 @@ class Spectra:
         Of the set-point.
     weight : (K,) array
         Of each line in a least-squares fit: what is in E, with it, is about as large on all lines.
+    common : float
+        Power on each line of E that rounding can have in common with the command, see :func:`common_rounding`.
     """
 
     omega_rad_s: FloatArray
@@ -41,6 +43,36 @@ class Spectra:
     U: ComplexArray
     R: ComplexArray | None
     weight: FloatArray
+    common: float = 0.0
+
+
+def common_rounding(y: FloatArray) -> float:
+    """Return the variance of readings' rounding that goes with what they measure [unit of y, squared].
+
+    Parameters
+    ----------
+    y : (N,) array
+        Measurement, NaN where a sample was bad.
+
+    Notes
+    -----
+    What repeats is rounded alike each time: it is no noise, and no residual shows it. Noise of sd s before rounding to
+    multiples of q leaves exp(-(2 pi s / q)^2) of its power, for that is the square of the first harmonic of a saw tooth
+    averaged over the noise; s is what changes from row to row beyond a straight line, less rounding's own share. Bias:
+    y that bends within three rows counts as noise; it goes through many steps then, so that little is common. As a
+    power it is spread over all lines: of a y of three or four values that repeats, few lines carry most of it.
+
+    References
+    ----------
+    Widrow and Kollar, Quantization Noise, Cambridge 2008, chapter 19 (dither).
+    """
+    y = y[np.isfinite(y)]
+    step = smallest_step(y)
+    if y.size < 3 or step == 0.0:
+        return 0.0
+    rounding = step**2 / 12.0
+    noise = max(float(np.mean(np.diff(y, 2) ** 2)) / 6.0 - rounding, 0.0)
+    return rounding * float(np.exp(-noise * (2.0 * np.pi / step) ** 2))
 
 
 def clean_measurement(t: FloatArray, y: FloatArray, name: str) -> tuple[FloatArray, int]:
@@ -99,7 +131,7 @@ def _wild(y: FloatArray) -> BoolArray:
 
 
 def record_spectra(
-    t: FloatArray, u: FloatArray, e: FloatArray, r: FloatArray | None, *, highest_rad_s: float
+    t: FloatArray, u: FloatArray, e: FloatArray, r: FloatArray | None, *, highest_rad_s: float, common: float = 0.0
 ) -> Spectra:
     """Transform one record.
 
@@ -111,6 +143,8 @@ def record_spectra(
         Set-point.
     highest_rad_s : float
         Lines above are not returned.
+    common : float
+        Variance of e that goes with the command, as :func:`common_rounding` returns it.
 
     Notes
     -----
@@ -142,6 +176,7 @@ def record_spectra(
         U=np.fft.rfft(levels)[k] / n * within,
         R=np.fft.rfft(r - r.mean())[k] / n if r is not None else None,
         weight=_whitening(e, omega * step),
+        common=common / n,
     )
 
 

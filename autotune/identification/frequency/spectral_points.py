@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -15,7 +16,7 @@ from autotune.identification.frequency.excitation import repeat_length
 from autotune.identification.frequency.limit_cycle_points import LimitCycle
 from autotune.identification.frequency.local_polynomial import LocalEstimate, local_estimate
 from autotune.identification.frequency.reference_model import ReferenceModel, fit_reference, simulate_reference
-from autotune.identification.frequency.spectra import Spectra, clean_measurement, record_spectra
+from autotune.identification.frequency.spectra import Spectra, clean_measurement, common_rounding, record_spectra
 from autotune.identification.parametric import PlantFit
 from autotune.points import FrequencyPoint
 from autotune.recording import Recording
@@ -82,14 +83,17 @@ def points_of_spectra(recording: Recording, largest_relative_sd: float) -> Frequ
         rows = repeat * (t.size // repeat)
         t, u, y = t[-rows:], u[-rows:], y[-rows:]
     notes = [f"{bad} wild or missing samples of y were interpolated"] if bad else []
-    highest = _HIGHEST_PART * 2.0 * math.pi / float(np.mean(np.diff(t)))
+    transform = partial(
+        record_spectra, t, u, r=r, common=common_rounding(recording.y),
+        highest_rad_s=_HIGHEST_PART * 2.0 * math.pi / float(np.mean(np.diff(t))),
+    )  # fmt: skip
     kind: Excitation = "random or steps" if repeat is None else "repeated command"
     kind = "closed loop by way of r" if r is not None else kind
     source = {"random or steps": "local polynomial", "repeated command": "spectral"}.get(kind, "closed loop")
     kept: tuple[FrequencyPoint, ...] = ()
     tried = 0
     for per_decade in _PER_DECADE:
-        estimates, reference = _estimate_corrected(t, u, y, r, highest, repeat=repeat, per_decade=per_decade)
+        estimates, reference = _estimate_corrected(transform, t, u, y, repeat=repeat, per_decade=per_decade)
         points = [point for one in estimates if (point := _point(one, reference, source)) is not None]
         enough = tuple(point for point in points if _relative_sd(point, reference) <= largest_relative_sd)
         if len(enough) > len(kept):
@@ -121,11 +125,10 @@ def _moving_setpoint(recording: Recording) -> FloatArray | None:
 
 
 def _estimate_corrected(
+    transform: Callable[..., Spectra],
     t: FloatArray,
     u: FloatArray,
     y: FloatArray,
-    r: FloatArray | None,
-    highest: float,
     *,
     repeat: int | None,
     per_decade: int,
@@ -133,7 +136,7 @@ def _estimate_corrected(
     """Estimate on y, then again on what a rough model leaves of it, if one describes the estimates at all."""
     centred = u - u.mean()
     reference: ReferenceModel | None = None
-    spectra = record_spectra(t, u, y, r, highest_rad_s=highest)
+    spectra = transform(e=y)
     estimates = _estimates(spectra, t.size, repeat, per_decade)
     for _ in range(_ROUNDS):
         points = [point for one in estimates if (point := _point(one, reference, ""))]
@@ -144,7 +147,7 @@ def _estimate_corrected(
         for integrating in (False, True):
             trial = _reference(points, spectra, integrating)
             left = y - simulate_reference(t, centred, trial)
-            trial_spectra = record_spectra(t, u, left, r, highest_rad_s=highest)
+            trial_spectra = transform(e=left)
             trial_estimates = _estimates(trial_spectra, t.size, repeat, per_decade)
             if _scatter(trial_estimates) < best:
                 best, better = _scatter(trial_estimates), (trial, trial_spectra, trial_estimates)
@@ -195,10 +198,15 @@ def _on_excited_lines(spectra: Spectra, repeats: int) -> list[LocalEstimate]:
             (spectra.weight * spectra.E)[window, None],
             float(spectra.omega_rad_s[line]),
             excited=_near(excited, int(line), window),
+            common=_weighted_common(spectra, window),
         )
         if one is not None:
             found.append(one)
     return found
+
+
+def _weighted_common(spectra: Spectra, window: slice) -> float:
+    return spectra.common * float(np.mean(spectra.weight[window] ** 2))
 
 
 def _near(excited: BoolArray, line: int, window: slice) -> BoolArray:
@@ -225,7 +233,10 @@ def _on_grid(spectra: Spectra, per_decade: int) -> list[LocalEstimate]:
             low, high = middle - _LEAST_LINES // 2, middle + _LEAST_LINES // 2 + 1
         if low < free or high > omega.size:
             continue
-        one = local_estimate(omega[low:high], X[low:high], Z[low:high], float(centre))
+        window = slice(low, high)
+        one = local_estimate(
+            omega[window], X[window], Z[window], float(centre), common=_weighted_common(spectra, window)
+        )
         if one is not None:
             found.append(one)
             free = high

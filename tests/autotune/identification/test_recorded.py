@@ -5,13 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from autotune.cli import app
 from autotune.errors import IdentificationError
 from autotune.identification.frequency.local_polynomial import local_estimate
 from autotune.identification.frequency.recorded import combine, frequency_points
-from autotune.identification.frequency.spectra import clean_measurement
+from autotune.identification.frequency.spectra import clean_measurement, common_rounding
 from autotune.identification.frequency.spectral_points import FrequencyEstimate
 from autotune.model_tables import read_model
 from autotune.models import TransferFunction
@@ -84,6 +86,33 @@ def test_regions_hold_the_truth_at_the_lowest_lines_where_a_window_is_wide() -> 
         error = point.response - complex(plant.response(np.array([point.omega_rad_s]))[0])
         inside.append(abs(error) ** 2 < 5.99 * point.covariance[0][0])
     assert np.mean(inside) >= 0.88
+
+
+@pytest.mark.parametrize("hold", [20, 40])
+def test_regions_hold_the_truth_where_a_coarse_converter_rounds_every_step_alike(hold: int) -> None:
+    """What repeats is rounded alike each time and in no residual: of 95 % regions .44 to .47 held the truth."""
+    plant, inside = TransferFunction(num=(2.0,), den=(10.0, 1.0)), []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        u = np.repeat(rng.choice([-1.0, 1.0], 1200 // hold + 1), hold)[:1200]
+        y = np.round(drive(plant, u, 1.0) + rng.normal(0.0, 0.02, u.size) + rng.uniform(0.0, 1.0))
+        for point in frequency_points(Recording(t=np.arange(1200.0), u=u, y=y)).points:
+            error = point.response - complex(plant.response(np.array([point.omega_rad_s]))[0])
+            inside.append(abs(error) ** 2 < 5.99 * point.covariance[0][0])
+    assert len(inside) >= 50
+    assert np.mean(inside) >= 0.88
+
+
+@given(st.floats(1e-6, 1e6), st.floats(0.5, 3.0), st.integers(0, 2**32 - 1))
+def test_noise_before_a_converter_leaves_nothing_of_its_rounding_in_common(step: float, sd: float, seed: int) -> None:
+    y = np.sin(np.arange(2000) / 50.0) * 3.0 + np.random.default_rng(seed).normal(0.0, sd, 2000)
+    assert common_rounding(step * np.round(y)) < 1e-2 * step**2 / 12.0
+
+
+@given(st.floats(1e-6, 1e6), st.floats(2.0, 50.0))
+def test_a_slow_wave_is_rounded_alike_each_time(step: float, amplitude: float) -> None:
+    y = step * np.round(np.sin(np.arange(2000) / 300.0) * amplitude)
+    assert 0.3 * step**2 / 12.0 < common_rounding(y) <= step**2 / 12.0 * (1.0 + 1e-9)
 
 
 def test_regions_hold_the_truth_under_a_multisine() -> None:
@@ -215,8 +244,10 @@ def test_a_broken_sensor_and_a_dead_command_are_refused() -> None:
     y[: y.size // 4] = np.nan
     with pytest.raises(IdentificationError, match="missing or wild"):
         frequency_points(Recording(t=recording.t, u=recording.u, y=y))
-    with pytest.raises(IdentificationError, match="never changes"):
+    with pytest.raises(IdentificationError, match="the command never changes"):
         frequency_points(Recording(t=recording.t, u=np.full(ROWS, 3.0), y=recording.y))
+    with pytest.raises(IdentificationError, match="y never changes"):
+        frequency_points(Recording(t=recording.t, u=multisine(rng), y=np.full(ROWS, 3.0)))
 
 
 def test_noise_alone_gives_no_points() -> None:
