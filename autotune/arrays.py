@@ -102,3 +102,8 @@ def smallest_step(signal: FloatArray) -> float:
     """Return the smallest difference between values (N,) of a signal, below 1e-6 of its range none; 0 of one value."""
     apart = np.diff(np.unique(signal))
     return float(np.min(apart, where=apart > 1e-6 * np.ptp(signal), initial=np.inf)) if apart.size else 0.0
+
+
+def is_constant(values: FloatArray) -> bool:
+    """Return whether values (N,), one at least and all finite, differ by no more than rounding."""
+    return bool(np.ptp(values) <= 1e-12 * np.max(np.abs(values)))

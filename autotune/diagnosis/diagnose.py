@@ -109,10 +109,8 @@ def _diagnosis(
     verdict = "unexplained" if instead else judged(evidence)
     named = [e for e in found_effects(evidence, verdict) if e.name in kept]
     own = {name: p * share_of(name, evidence.candidates) for name, p in said.items()}
-    others, ruled_out = (
-        {n: p for n, p in own.items() if n not in {e.name for e in named}},
-        1.0 - evidence.limits.decided,
-    )
+    others = {name: p for name, p in own.items() if name not in {e.name for e in named}}
+    ruled_out = 1.0 - evidence.limits.decided
     effects = tuple(
         replace(e, probability=own[e.name], alike=alike(e.name, others, ruled_out), together=said[e.name])
         for e in named

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from autotune.arrays import FloatArray
+from autotune.arrays import FloatArray, is_constant
 from autotune.distributions import log_normal_tail, normal_tail
 from autotune.errors import IdentificationError
 from autotune.recording import Recording
@@ -149,7 +149,7 @@ def only_follows(recordings: Sequence[Recording]) -> bool:
 
 def _moving(recordings: Sequence[Recording]) -> list[Recording]:
     """Return the recordings whose u moves."""
-    return [recording for recording in recordings if not _is_constant(_bridge(recording.u))]
+    return [recording for recording in recordings if not is_constant(_bridge(recording.u))]
 
 
 def _answer(moving: Sequence[Recording], found: Sequence[Dependence]) -> bool:
@@ -230,15 +230,11 @@ def _answers_a_test(recording: Recording, found: Dependence) -> bool:
     return plant_evidence(recording) > NEEDED
 
 
-def _is_constant(values: FloatArray) -> bool:
-    return bool(np.ptp(values) <= 1e-12 * np.max(np.abs(values)))
-
-
 def _require_two_signals(recording: Recording) -> None:
     u, y = _bridge(recording.u), _bridge(recording.y)
     v, w = u - u.mean(), y - y.mean()
     apart = w - (float(v @ w) / float(v @ v)) * v
-    if not _is_constant(y) and float(np.linalg.norm(apart)) <= _COPY * float(np.linalg.norm(w)):
+    if not is_constant(y) and float(np.linalg.norm(apart)) <= _COPY * float(np.linalg.norm(w)):
         raise IdentificationError(
             "y is u, in every row, up to unit and offset: one signal under two names",
             where=recording.name,

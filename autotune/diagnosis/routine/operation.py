@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from autotune.arrays import FloatArray, IntArray
+from autotune.arrays import FloatArray, IntArray, is_constant
 from autotune.diagnosis.routine.thresholds import RoutineThresholds
 from autotune.errors import InputError
 from autotune.recording import Recording
@@ -133,13 +133,13 @@ def _even(recording: Recording, limits: RoutineThresholds) -> Recording:
             f"u is missing in {int(bad.sum())} row(s), first at t = {recording.t[int(np.argmax(bad))]:g} s",
             where=recording.name, remedy="give a stretch in which every command was recorded",
         )  # fmt: skip
-    if float(np.ptp(recording.u)) <= 1e-12 * max(float(np.max(np.abs(recording.u))), 1e-300):
+    if is_constant(recording.u):
         raise InputError(
             f"u is constant ({recording.u[0]:g}): a valve that is not moved shows nothing", where=recording.name,
             remedy="check the column, or give a record of the loop in automatic mode",
         )  # fmt: skip
     readings = recording.y[np.isfinite(recording.y)]
-    if readings.size == 0 or float(np.ptp(readings)) <= 1e-12 * float(np.max(np.abs(readings))):
+    if readings.size == 0 or is_constant(readings):
         raise InputError(
             f"y is constant ({readings[0]:g})" if readings.size else "y has no reading", where=recording.name,
             remedy="check the column and the sensor: what never answers shows nothing of the valve",

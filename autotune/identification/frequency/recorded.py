@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from autotune.arrays import FloatArray
+from autotune.arrays import is_constant
 from autotune.distributions import chi2_tail
 from autotune.errors import IdentificationError
 from autotune.identification.frequency.excitation import relay_segments
@@ -83,19 +83,17 @@ def frequency_points(recording: Recording, *, largest_relative_sd: float = 0.5) 
     into u is correlated with u and would bias y over u towards -1/C; it is not correlated with r.
     """
     recording.require_finite(("u",))
-    _require_moving(recording.u, "the command", recording.name)
-    _require_moving(recording.y[np.isfinite(recording.y)], "y", recording.name)
+    for what, values in (("the command", recording.u), ("y", recording.y[np.isfinite(recording.y)])):
+        if values.size and is_constant(values):
+            raise IdentificationError(
+                f"{what} never changes", where=recording.name, remedy="record an experiment that moves u and y"
+            )
     segments = relay_segments(recording)
     if sum(end - start for start, end in segments) >= _RELAY_PART * recording.duration_s or (
         segments and "relay" in recording.metadata
     ):
         return _of_relay(recording, segments, largest_relative_sd)
     return points_of_spectra(recording, largest_relative_sd)
-
-
-def _require_moving(values: FloatArray, what: str, name: str) -> None:
-    if not values.size or np.ptp(values) <= 1e-12 * max(float(np.max(np.abs(values))), 1e-300):
-        raise IdentificationError(f"{what} never changes", where=name, remedy="record an experiment that moves u and y")
 
 
 def _of_relay(

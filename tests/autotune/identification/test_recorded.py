@@ -244,6 +244,8 @@ def test_a_broken_sensor_and_a_dead_command_are_refused() -> None:
     y[: y.size // 4] = np.nan
     with pytest.raises(IdentificationError, match="missing or wild"):
         frequency_points(Recording(t=recording.t, u=recording.u, y=y))
+    with pytest.raises(IdentificationError, match="3000 of 3000 samples of y are missing"):
+        frequency_points(Recording(t=recording.t, u=recording.u, y=np.full(ROWS, np.nan)))
     with pytest.raises(IdentificationError, match="the command never changes"):
         frequency_points(Recording(t=recording.t, u=np.full(ROWS, 3.0), y=recording.y))
     with pytest.raises(IdentificationError, match="y never changes"):
