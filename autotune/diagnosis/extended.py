@@ -109,7 +109,7 @@ def _ended(effect: Effect, result: Fit, data: Data, nominal: Model) -> Effect:
         "high": high + _reach([kind.goes_on(values, high + b) for b in beyond], beyond),
     }
     given = {key: Parameter(value=value, unit=unit) for key, value in ends.items()}
-    if "slope" in values:
+    if kind.place == "actuator":
         rest = -result.sim.u_offset
         if low >= rest:
             given["low"] = replace(given["low"], value=max(ends["low"], rest))

@@ -34,8 +34,8 @@ def servo(gain: float = 5.0, tau: float = 0.25) -> Model:
     )
 
 
-def rig(seed: int, drag: float = 0.0, rows: int = 1500, noise: float = 0.01) -> Recording:
-    """tau dv/dt = -v - drag v |v| + gain u under a P controller, by RK4 in steps of a fifth of the sample time."""
+def rig(seed: int, drag: float = 0.0, rows: int = 1500, noise: float = 0.01, along: float = 0.0) -> Recording:
+    """tau dv/dt = -v - drag v |v| + gain (1 + along x) u under a P controller, by RK4, five steps in a sample time."""
     rng = np.random.default_rng(seed)
     dt, gain, tau, K = 0.02, 5.4, 0.23, 0.9
     v = x = 0.0
@@ -45,15 +45,15 @@ def rig(seed: int, drag: float = 0.0, rows: int = 1500, noise: float = 0.01) -> 
         y[k] = x + noise * rng.normal()
         u[k] = K * (aim[k] - y[k]) + 0.3 * np.sin(5.0 * k * dt)
 
-        def slope(v: float, push: float = u[k]) -> float:
-            return (-v - drag * v * abs(v) + gain * push) / tau
+        def slope(v: float, x: float, push: float = u[k]) -> float:
+            return (-v - drag * v * abs(v) + gain * (1.0 + along * x) * push) / tau
 
         for _ in range(5):
             h = dt / 5
-            k1 = slope(v)
-            k2 = slope(v + 0.5 * h * k1)
-            k3 = slope(v + 0.5 * h * k2)
-            k4 = slope(v + h * k3)
+            k1 = slope(v, x)
+            k2 = slope(v + 0.5 * h * k1, x + 0.5 * h * v)
+            k3 = slope(v + 0.5 * h * k2, x + 0.5 * h * v)
+            k4 = slope(v + h * k3, x + h * v)
             x += h * (v + h / 6.0 * (k1 + k2 + k3))
             v += h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
     return Recording(t=dt * np.arange(rows), u=u, y=y)
@@ -75,6 +75,15 @@ def test_a_drag_left_out_is_named_with_its_coefficient() -> None:
     assert abs(coefficient.value - 0.15) < 4.0 * coefficient.sd + 0.005
     assert found.fit.extended < 1.1 * found.fit.noise_floor < found.fit.retuned
     assert not found.withheld
+
+
+def test_an_extended_model_has_the_numbers_of_the_finding() -> None:
+    name = "plant.position_dependent_gain"
+    found = diagnose(servo(), [rig(4, along=0.12), rig(5, along=0.12)], without=[n for n in CATALOGUE if n != name])
+    (effect,) = found.effects
+    slope = effect.parameters["slope"].value
+    assert slope == pytest.approx(0.12, rel=0.03)
+    assert found.extended_model.effects[0].values["slope"] == slope
 
 
 def test_intervals_of_the_retuned_gain_cover_the_truth_in_closed_loop() -> None:
