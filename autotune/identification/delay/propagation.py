@@ -85,6 +85,9 @@ def schedule(
     count = 0
     while k < ty.size and count < BLOCK:
         until = ty[k]
+        # a command that is held at the value it has does not cut the time: steps and relays leave one piece per output
+        while not linear and j + 1 < tu.size and tu[j + 1] + h < until and u[j + 1] == (u[j] if j >= 0 else before):
+            j += 1
         crossing = j + 1 < tu.size and tu[j + 1] + h < until
         if crossing:
             until = max(tu[j + 1] + h, now)

@@ -16,6 +16,7 @@ from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.output_error import Point, Structure, solve_linear
 from autotune.identification.delay.output_error_model import finish
+from autotune.identification.delay.propagation import schedule
 from autotune.identification.delay.response import linear_part, normal_matrix, output, sensitivities
 from autotune.recording import Recording, read_recording
 from tests.autotune.identification.delay_examples import X0, A, B, example_2, held_response
@@ -289,6 +290,15 @@ def test_more_parameters_than_rows_are_refused():
     u = np.where(t > 2, 1.0, 0.0)
     with pytest.raises(IdentificationError, match="rows"):
         identify_delay(Recording(t=t, u=u, y=np.sin(t)), 3)
+
+
+def test_the_time_is_cut_where_the_command_changes_and_nowhere_else():
+    t = 0.1 * np.arange(1000)
+    u = np.repeat([0.0, 1.0, 1.0, -2.0], 250)  # changes in rows 250 and 750
+    pieces, outputs, durations, which = schedule(t, u, 0.0, False, t, 0.03, np.array([t[0], -1.0, 0.0]))
+    assert (outputs, which.size) == (1000, 1002)
+    assert durations[which].sum() == pytest.approx(t[-1])
+    assert pieces[: which.size, 0] @ pieces[: which.size, 1] == pytest.approx(50.0 - 2.0 * (24.9 - 0.03))
 
 
 def test_cost_is_the_sum_of_squares_and_the_gram_matrix_is_linear_in_rows():
