@@ -115,7 +115,8 @@ def relay_edges(t: FloatArray, u: FloatArray) -> RelayEdges:
         level = np.where(np.searchsorted(times, t[settled], side="right") % 2 == 1, 1.0, -1.0)
         basis = np.column_stack([level, np.ones_like(level), t[settled] - t[-1]])
         left = u[settled] - basis @ np.linalg.lstsq(basis, u[settled], rcond=None)[0]
-        if float(left @ left) > (1.0 - _SQUARE_WAVE_PART) * float(np.sum((u[settled] - u[settled].mean()) ** 2)):
+        apart = u[settled] - np.sum(u[settled]) / max(left.size, 1)  # no row is settled where u switches in every one
+        if float(left @ left) > (1.0 - _SQUARE_WAVE_PART) * float(apart @ apart):
             raise IdentificationError(
                 "the command is not a relay's: it has more than two levels",
                 where="limit cycle",

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from autotune.errors import IdentificationError
 from autotune.identification.frequency.describing import describing_function
 from autotune.identification.frequency.harmonics import held_coefficients
+from autotune.identification.frequency.limit_cycle import relay_edges
 from autotune.identification.frequency.limit_cycle_points import LimitCycle, limit_cycle_points
 from autotune.identification.noise_colour import noise_colour
 from autotune.models import TransferFunction
@@ -32,6 +33,13 @@ def distance(cycle: LimitCycle, plant: TransferFunction = BALL) -> complex:
     point = cycle.points[0]
     truth = complex(plant.response(np.array([point.omega_rad_s]))[0])
     return point.response / truth - 1
+
+
+def test_a_command_that_switches_in_every_row_is_still_a_relays() -> None:
+    """No row is left that holds a level: their mean was asked of none."""
+    edges = relay_edges(np.arange(50.0), np.resize([1.0, -1.0], 50))
+    assert edges.jump == 2.0
+    assert edges.times_s.size >= 48
 
 
 def test_a_row_of_the_relay_before_is_no_switch_of_the_relay_after_it() -> None:
