@@ -20,7 +20,7 @@ import tomli_w
 from scipy.optimize import minimize_scalar
 
 from autotune.arguments import check_arguments
-from autotune.arrays import BoolArray, FloatArray, is_real
+from autotune.arrays import BoolArray, FloatArray, is_constant, is_real
 from autotune.errors import InputError
 from autotune.text_files import check_path, printable, read_toml
 from autotune.whole_files import append_whole, write_whole
@@ -302,7 +302,7 @@ def usable(recording: Recording, *, moving: bool = True) -> Recording:
     y = recording.y[np.isfinite(recording.y)]
     if y.size < 2:
         raise InputError("column 'y' has no numbers", where=recording.name, remedy="give a recording with measurements")
-    if moving and float(np.ptp(y)) <= 1e-12 * float(np.max(np.abs(y))):
+    if moving and is_constant(y):
         raise InputError(
             f"column 'y' is constant ({y[0]:g}): nothing can be learnt from it",
             where=recording.name,

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from autotune.arrays import ComplexArray, FloatArray
+from autotune.arrays import ComplexArray, FloatArray, is_constant
 from autotune.controller import Controller
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.closed_loop.confidence import (
@@ -142,8 +142,8 @@ def identify_closed_loop(
     InputError
         A controller that contradicts the data.
     IdentificationError
-        Too few equidistant rows, a command that does not move or only by the feedback, a plant of the asked order
-        that the data do not determine.
+        Too few equidistant rows, a command that does not move or only by the feedback, a plant of the asked order that
+        the data do not determine.
 
     Notes
     -----
@@ -201,7 +201,7 @@ def _starts(pieces: Sequence[Recording]) -> tuple[int, ...]:
 def _columns(pieces: Sequence[Recording]) -> tuple[FloatArray, FloatArray, FloatArray | None]:
     u, y = (np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("u", "y"))
     for name, values in (("u", u), ("y", y)):
-        if np.ptp(values) <= 1e-12 * max(1.0, float(np.max(np.abs(values)))):
+        if is_constant(values):
             raise IdentificationError(
                 f"{name} does not move", where=pieces[0].name, remedy="move the set-point or add a dither"
             )
@@ -241,8 +241,7 @@ def _look(u: FloatArray, y: FloatArray, r: FloatArray | None, starts: tuple[int,
     few = Series(u=u, y=y, starts=starts).head(_LOOK_ROWS)
     p = min(12, default_past_window(len(few), 2))
     motion = own_motion(lagged_data(few.u, few.y, p, few.starts))
-    moves = r is not None and float(np.ptp(r)) > 1e-9 * max(1.0, float(np.max(np.abs(r))))
-    require_excitation(motion, r_recorded=r is not None, r_moves=moves, where=name)
+    require_excitation(motion, r_recorded=r is not None, r_moves=r is not None and not is_constant(r), where=name)
     return motion
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.signal import lfilter
 
-from autotune.arrays import FloatArray
+from autotune.arrays import FloatArray, is_constant
 from autotune.controller import Controller, DiscreteController
 from autotune.errors import InputError
 from autotune.identification.closed_loop.control_law import check_law
@@ -99,7 +99,7 @@ def _excitation(recording: Recording, controller: Controller | None) -> tuple[Fl
                 where=recording.name,
                 remedy="record what moved the loop, or take a direct method: prediction-error, pbsid, ssarx",
             )
-        return added if added is not None and (r is None or np.ptp(r) == 0.0) else _plain(r, added), None
+        return added if added is not None and (r is None or is_constant(r)) else _plain(r, added), None
     law = check_law(controller, recording.u, recording.y, r, recording.sample_time_s, added=added)
     if law.contradicts:
         raise InputError(

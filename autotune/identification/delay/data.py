@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from autotune.arrays import FloatArray
+from autotune.arrays import FloatArray, is_constant
 from autotune.errors import IdentificationError, InputError
 from autotune.models import Hold
 from autotune.recording import Recording
@@ -149,14 +149,13 @@ def _require_no_gap(recording: Recording) -> None:
 
 
 def _require_motion(u: FloatArray, y: FloatArray, name: str) -> None:
-    scale = np.finfo(np.float64).eps * 100.0
-    if np.ptp(u) <= scale * max(1.0, float(np.max(np.abs(u)))):
+    if is_constant(u):
         raise IdentificationError(
             f"the input is constant (u = {u[0]:g}): neither gain nor delay show",
             where=name,
             remedy="move u: a step, a relay, or a set-point change in closed loop",
         )
-    if np.ptp(y) <= scale * max(1.0, float(np.max(np.abs(y)))):
+    if is_constant(y):
         what = "zero" if y[0] == 0.0 else f"constant (y = {y[0]:g})"
         raise IdentificationError(
             f"the output is {what} although u moves: nothing to identify",

@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from autotune.arrays import BoolArray, ComplexArray, FloatArray
+from autotune.arrays import BoolArray, ComplexArray, FloatArray, is_constant
 from autotune.errors import IdentificationError
 from autotune.identification.frequency.excitation import repeat_length
 from autotune.identification.frequency.limit_cycle_points import LimitCycle
@@ -115,7 +115,7 @@ def points_of_spectra(recording: Recording, largest_relative_sd: float) -> Frequ
 def _moving_setpoint(recording: Recording) -> FloatArray | None:
     """Return r where it was recorded, moves, and moves u: more than chance would correlate them."""
     r = recording.extra.get("r")
-    if r is None or not np.all(np.isfinite(r)) or np.ptp(r) <= 1e-9 * max(float(np.max(np.abs(r))), 1e-300):
+    if r is None or not np.all(np.isfinite(r)) or is_constant(r):
         return None
     n = r.size
     a, b = np.fft.rfft(r - r.mean(), 2 * n), np.fft.rfft(recording.u - recording.u.mean(), 2 * n)
