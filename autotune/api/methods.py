@@ -319,6 +319,8 @@ def delay(
     >>> abs(model.delay_s - 0.5) < 0.05
     True
     """
+    from autotune.identification.dependence import require_answer
+
     way = one_of(method, DELAY_METHODS, name="method", where="delay")
     order = int(number(order, name="order", where="delay", above=0, whole=True))
     if interval_s is not None:
@@ -330,19 +332,24 @@ def delay(
         from autotune.identification.delay.two_delays import intervals_of, two_delays
 
         asked = settings_of(two_delays, settings, where="delay, delays = 2")
+        require_answer([record])
         return two_delays(record, intervals_of(record, interval_s), **asked)
     if way == "output-error":
         from autotune.identification.delay.identify import identify_delay
 
         if interval_s is not None:
             raise InputError("interval_s is of the modulating functions", where="delay", remedy='method="algebraic"')
-        return identify_delay(record, order, **settings_of(identify_delay, settings, where="delay"))
+        asked = settings_of(identify_delay, settings, where="delay")
+        require_answer([record])
+        return identify_delay(record, order, **asked)
     from autotune.identification.delay.methods import algebraic_delay, online_delay
 
     if way == "algebraic":
         asked = settings_of(algebraic_delay, {"interval_s": interval_s, **settings}, where="delay, algebraic")
+        require_answer([record])
         return algebraic_delay(record, order, **asked)
     asked = settings_of(online_delay, settings, where="delay, online")
+    require_answer([record])
     if "start_s" not in asked:
         asked["start_s"] = algebraic_delay(record, order, interval_s=interval_s).delay_s
     return online_delay(record, order, **asked)
@@ -385,6 +392,7 @@ def closed_loop(
     5
     """
     from autotune.identification.closed_loop.methods import METHODS, Windows
+    from autotune.identification.dependence import require_answer
 
     way = one_of(method, METHODS, name="method", where="closed_loop")
     if order is not None:
@@ -399,10 +407,12 @@ def closed_loop(
         from autotune.identification.closed_loop.identify import identify_closed_loop
 
         asked = settings_of(identify_closed_loop, settings, where="closed_loop")
+        require_answer([record])
         return identify_closed_loop(record, order=order, controller=law, **asked)
     from autotune.identification.closed_loop.signals import model_of_recording
 
     windows = Windows(**settings_of(Windows, settings, where=f"closed_loop, {way}"))
+    require_answer([record])
     return model_of_recording(record, method=way, order=order, controller=law, more=more, windows=windows)
 
 

@@ -57,7 +57,7 @@ def frequency_points(source: Source, *, largest_relative_sd: float = 0.5, **name
     Raises
     ------
     IdentificationError
-        The recordings move too little, or contradict each other.
+        The recordings move too little, or y does not answer u beyond chance.
 
     Examples
     --------
@@ -67,15 +67,14 @@ def frequency_points(source: Source, *, largest_relative_sd: float = 0.5, **name
     >>> float(abs(points[0].response) / 2.0) > 0.9
     True
     """
-    from autotune.identification.frequency.recorded import combine
-    from autotune.identification.frequency.recorded import frequency_points as estimate
+    from autotune.identification.frequency.recorded import combine, session_points, sessions
 
     largest_relative_sd = number(largest_relative_sd, name="largest_relative_sd", where="frequency_points", above=0.0)
     if isinstance(source, str | os.PathLike) and os.fspath(source).endswith(".json"):
         return Points(read_points(source))
     names = settings_of(read, names, where="frequency_points")
-    estimates = [estimate(one, largest_relative_sd=largest_relative_sd) for one in recordings(source, **names)]
-    combined = combine(estimates)
+    data = sessions(recordings(source, **names))
+    combined = combine([session_points(one, largest_relative_sd=largest_relative_sd) for one in data])
     return Points(combined.points, combined.notes)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from autotune.arrays import is_constant
 from autotune.batch.operation import look_in_operation, row_of
 from autotune.batch.pieces import Record, read_record
 from autotune.batch.plant_figures import plant_figures
@@ -27,6 +28,7 @@ from autotune.errors import AutotuneError, IdentificationError
 from autotune.experiment_design.next_experiment import with_next_experiment
 from autotune.identification.closed_loop.identify import identify_closed_loop
 from autotune.identification.closed_loop.loop_plant import loop_plant
+from autotune.identification.dependence import require_answer
 from autotune.identification.frequency.recorded import combine, frequency_points
 from autotune.identification.frequency.spectral_points import FrequencyEstimate
 from autotune.identification.parametric import PlantFit
@@ -180,6 +182,7 @@ def _points(
     """Return the points of all pieces together and a loop's plant; what tells nothing is a note beside others."""
     if settings.method == "closed-loop":
         longest = max(record.pieces, key=len)
+        require_answer([longest])
         found = identify_closed_loop(longest, controller=present)
         if not found.design_points:
             raise IdentificationError(
@@ -205,7 +208,7 @@ def _estimate_points(piece: Recording) -> FrequencyEstimate:
     """Estimate points, but not from a loop that nothing but its own feedback moved: they would lie at -1/C."""
     estimate = frequency_points(piece)
     r = piece.extra.get("r")
-    if r is not None and np.isfinite(r).all() and np.ptp(r) == 0.0 and estimate.excitation != "relay":
+    if r is not None and np.isfinite(r).all() and is_constant(r) and estimate.excitation != "relay":
         raise IdentificationError(
             "the set-point never moves, so that the command may follow the feedback alone",
             where=piece.name,

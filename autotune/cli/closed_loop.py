@@ -72,13 +72,11 @@ def closed_loop(
     place = Output(out, inputs=(recording, controller, config), overwrite=overwrite)  # refused before all imports
     from autotune.api import methods
     from autotune.controller import read_controller
-    from autotune.identification.closed_loop.identify import identify_closed_loop
+    from autotune.identification.closed_loop.identify import ClosedLoopIdentification
     from autotune.identification.closed_loop.state_space import InnovationModel
-    from autotune.identification.dependence import require_answer
 
     console = Console(stderr=True, highlight=False)
     data = read_one(recording, signal_names(t, u, y, r))
-    require_answer([data])
     law = None if controller is None else read_controller(controller)
     if method != "prediction-error" or more_u or more_y:
         if delay is not None or config is not None:
@@ -95,15 +93,16 @@ def closed_loop(
     if any(value is not None for value in (f, p, n_cl, psi)):
         raise InputError("--f, --p, --n-cl and --psi are of the other methods", where="prediction-error")
     with console.status("reading the loop") as status:
-        result = identify_closed_loop(
+        result = methods.closed_loop(
             data,
-            order=order,
+            order,
             delay=delay,
             controller=law,
             max_order=max_order,
             limits=None if config is None else _limits(config),
             progress=lambda what, _: status.update(f"fitting {what}"),
         )
+    assert isinstance(result, ClosedLoopIdentification)
     place.json(closed_loop_json(result))
     for warning in result.warnings:
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)

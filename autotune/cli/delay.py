@@ -76,13 +76,11 @@ def identify_delay_command(
     place = Output(out, inputs=(recording,), overwrite=overwrite)  # refused before the method is imported
     from autotune.api import methods
     from autotune.identification.delay.model import DelayModel, write_delay_model
-    from autotune.identification.dependence import require_answer
 
     record = read_one(recording, signal_names(t, u, y, r))
     if hold is not None:
         record = replace(record, metadata={**record.metadata, "hold": hold})
     announce_compiling()
-    require_answer([record])
     settings: dict[str, Any] = {}
     with Console(stderr=True).status("searching the delay") as status:
         if delays == 1 and method == "output-error":

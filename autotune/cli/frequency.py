@@ -37,16 +37,11 @@ def frequency(
     place = Output(out, inputs=recordings, overwrite=overwrite)  # refused before the method is imported
     from rich.progress import track
 
-    from autotune.identification.dependence import require_answer
     from autotune.identification.frequency.recorded import combine, session_points, sessions
-    from autotune.identification.frequency.windows import read_noted_windows
     from autotune.points import points_to_json
 
     estimates = []
     data = sessions(read_all(recordings, signal_names(t, u, y, r)))
-    for one in data:
-        if not read_noted_windows(one[0]):  # an experiment that noted its limit cycles has seen y answer
-            require_answer(one)
     for one in track(data, description="recordings", transient=True, disable=len(data) < 2):
         estimates.append(session_points(one, largest_relative_sd=largest_sd))
     for one, estimate in zip(data, estimates, strict=True):

@@ -51,7 +51,8 @@ class Dependence:
     backward : float
         Of u to what y was in earlier rows: a feedback, or a swapped pair.
     same_row : float
-        Of the two innovations in one row, in standard deviations: a controller's, since y is measured before u acts.
+        Of the two innovations in one row, in standard deviations: a controller's, since y is measured before u acts; 0
+        where u acted before, as ``first_lag`` 0 says or y, which goes on in the next row with the same sign.
     lag : int
         Rows by which u came first where the relation forward is closest.
     sign : {1, -1}
@@ -72,12 +73,17 @@ class Dependence:
         """Whether y answers u, beyond chance."""
         return self.forward < CHANCE
 
+    @property
+    def follows_in_row(self) -> bool:
+        """Whether u follows y within its row, as what a controller makes of y does."""
+        return abs(self.same_row) > _SAME_ROW
+
 
 def recorded_dependence(recording: Recording) -> Dependence:
     """Return how likely chance alone relates y so closely to u, or to a set-point that moves and acts by way of u."""
-    found = dependence(recording.u, recording.y, first_lag=0 if recording.metadata.get("hold") == "linear" else 1)
-    r = recording.extra.get("r")
-    if found.answers or r is None or np.ptp(_bridge(r)) == 0.0:
+    found = _of_columns(recording)
+    r = _moving_setpoint(recording)
+    if found.answers or r is None:
         return found
     by_setpoint = dependence(r, recording.y, fed_back=False)
     return replace(by_setpoint, backward=found.backward, same_row=found.same_row, sign=found.sign)
@@ -85,10 +91,12 @@ def recorded_dependence(recording: Recording) -> Dependence:
 
 def is_fed_back(recording: Recording) -> bool:
     """Return whether a controller makes u of y: a set-point moves, or u follows y within its row."""
-    r = recording.extra.get("r")
-    if r is not None and np.ptp(_bridge(r)) > 0.0:
-        return True
-    return abs(dependence(recording.u, recording.y).same_row) > _SAME_ROW
+    return _moving_setpoint(recording) is not None or follows_in_row(recording)
+
+
+def follows_in_row(recording: Recording) -> bool:
+    """Return whether u follows y within its row, as what a controller makes of y does."""
+    return _of_columns(recording).follows_in_row
 
 
 def latest_answer_s(recording: Recording) -> float | None:
@@ -97,13 +105,22 @@ def latest_answer_s(recording: Recording) -> float | None:
     A dead time that is longer contradicts the record. In a loop that hardly anything but its own noise moves, a plant
     of the other sign, dead for several periods of the loop, fits about as well as the true one: it is 1/C, delayed.
     """
-    r = recording.extra.get("r")
-    if r is not None and np.ptp(_bridge(r)) > 0.0:
+    if _moving_setpoint(recording) is not None:
         return None
-    found = dependence(recording.u, recording.y)
-    if abs(found.same_row) <= _SAME_ROW or not found.answers:
+    found = _of_columns(recording)
+    if not found.follows_in_row or not found.answers:
         return None
     return _SMEARED * found.within * recording.sample_time_s
+
+
+def _of_columns(recording: Recording) -> Dependence:
+    return dependence(recording.u, recording.y, first_lag=0 if recording.metadata.get("hold") == "linear" else 1)
+
+
+def _moving_setpoint(recording: Recording) -> FloatArray | None:
+    """Return r, its gaps bridged, where it was recorded and moves."""
+    r = recording.extra.get("r")
+    return None if r is None or is_constant(_bridge(r)) else _bridge(r)
 
 
 def require_order(recordings: Sequence[Recording]) -> None:
@@ -158,7 +175,7 @@ def _answer(moving: Sequence[Recording], found: Sequence[Dependence]) -> bool:
 
 
 def _in_row(found: Sequence[Dependence]) -> bool:
-    return max(abs(one.same_row) for one in found) > _SAME_ROW
+    return any(one.follows_in_row for one in found)
 
 
 def _seem_swapped(found: Sequence[Dependence]) -> bool:
@@ -225,7 +242,7 @@ def _answers_a_test(recording: Recording, found: Dependence) -> bool:
     """Return whether y answers a few steps or ramps as a plant does, beyond what any colour of noise explains."""
     from autotune.identification.plant_evidence import NEEDED, is_simple_test, plant_evidence
 
-    if abs(found.same_row) > _SAME_ROW or not is_simple_test(_bridge(recording.u)):
+    if found.follows_in_row or not is_simple_test(_bridge(recording.u)):
         return False
     return plant_evidence(recording) > NEEDED
 
@@ -270,13 +287,15 @@ def dependence(u: FloatArray, y: FloatArray, *, first_lag: int = 1, fed_back: bo
     Haugh, Checking the independence of two covariance-stationary time series, JASA 71, 1976.
     """
     u, y, first, every = _thin(_bridge(u), _bridge(y), first_lag)
-    if min(u.size, y.size) < _LEAST_ROWS or np.ptp(u) == 0.0 or np.ptp(y) == 0.0:
+    if min(u.size, y.size) < _LEAST_ROWS or is_constant(u) or is_constant(y):
         return Dependence(forward=1.0, backward=1.0, same_row=0.0, lag=0, sign=1, within=0)
     e_u, e_y = _innovations(u, _COMMAND), _innovations(y, _ROUNDING)
     forward, lag, sign, within = _closest(_own_moves(u, y, e_u) if first and fed_back else e_u, e_y, first)
     backward, *_ = _closest(_innovations(y, _COMMAND), _innovations(u, _ROUNDING), 1)
     size = float(np.linalg.norm(e_u) * np.linalg.norm(e_y))
-    same = float(e_u @ e_y) / size * math.sqrt(e_u.size) if size > 0.0 else 0.0
+    same = float(e_u @ e_y) / size * math.sqrt(e_u.size) if size > 0.0 and first else 0.0
+    if lag == first and sign == np.sign(same):  # a controller's gain has the sign that turns the plant's answer back
+        same = 0.0
     return Dependence(
         forward=forward, backward=backward, same_row=same, lag=lag * every, sign=sign, within=within * every
     )

@@ -152,29 +152,23 @@ def _tune(recording: Recording, true: TransferFunction | None) -> bool:
 
 
 def _delay(recording: Recording, true: TransferFunction | None) -> bool:
-    from autotune.identification.delay.identify import identify_delay
-    from autotune.identification.dependence import require_answer
+    from autotune.api.methods import delay
 
-    require_answer([recording])
-    identify_delay(recording, 2)
+    delay(recording, 2)
     return True
 
 
 def _frequency(recording: Recording, true: TransferFunction | None) -> bool:
-    from autotune.identification.dependence import require_answer
     from autotune.identification.frequency.recorded import frequency_points
 
-    require_answer([recording])
     points = frequency_points(recording).points
     return true is None or max((_apart(point, true) for point in points), default=0.0) > _SURE
 
 
 def _closed_loop(recording: Recording, true: TransferFunction | None) -> bool:
-    from autotune.identification.closed_loop.identify import identify_closed_loop
-    from autotune.identification.dependence import require_answer
+    from autotune.api.methods import closed_loop
 
-    require_answer([recording])
-    points = identify_closed_loop(recording).points
+    points = closed_loop(recording).points
     return true is None or max((_apart(point, true) for point in points), default=0.0) > _SURE
 
 

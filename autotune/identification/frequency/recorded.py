@@ -10,6 +10,7 @@ import numpy as np
 from autotune.arrays import is_constant
 from autotune.distributions import chi2_tail
 from autotune.errors import IdentificationError
+from autotune.identification.dependence import follows_in_row, require_answer
 from autotune.identification.frequency.excitation import relay_segments
 from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
 from autotune.identification.frequency.spectral_points import FrequencyEstimate, points_of_spectra
@@ -31,8 +32,8 @@ def session_points(session: Sequence[Recording], *, largest_relative_sd: float =
     """Estimate the plant's frequency response from recordings that belong together, see :func:`sessions`.
 
     Recordings whose sidecar notes limit cycles give the very points that the experiment ended with: the fundamentals,
-    each with the others in its rough model, or those of all rows together. Parameters and errors as of
-    :func:`frequency_points`.
+    each with the others in its rough model, or those of all rows together: it has seen y answer, and few cycles say
+    little of that. Parameters and errors as of :func:`frequency_points`.
 
     Parameters
     ----------
@@ -74,7 +75,8 @@ def frequency_points(recording: Recording, *, largest_relative_sd: float = 0.5) 
     Raises
     ------
     IdentificationError
-        The command or y never changes, too few rows, a broken measurement, or nothing above the noise.
+        The command or y never changes, y does not answer u beyond chance, too few rows, a broken measurement, or
+        nothing above the noise; u follows y, and no set-point that moves u says how the plant answers.
 
     Notes
     -----
@@ -83,17 +85,26 @@ def frequency_points(recording: Recording, *, largest_relative_sd: float = 0.5) 
     into u is correlated with u and would bias y over u towards -1/C; it is not correlated with r.
     """
     recording.require_finite(("u",))
-    for what, values in (("the command", recording.u), ("y", recording.y[np.isfinite(recording.y)])):
-        if values.size and is_constant(values):
+    readings = recording.y[np.isfinite(recording.y)]
+    if readings.size:  # how many are missing is said where they are bridged
+        if is_constant(readings):
             raise IdentificationError(
-                f"{what} never changes", where=recording.name, remedy="record an experiment that moves u and y"
+                "y never changes", where=recording.name, remedy="record an experiment that moves u and y"
             )
+        require_answer([recording])
     segments = relay_segments(recording)
     if sum(end - start for start, end in segments) >= _RELAY_PART * recording.duration_s or (
         segments and "relay" in recording.metadata
     ):
         return _of_relay(recording, segments, largest_relative_sd)
-    return points_of_spectra(recording, largest_relative_sd)
+    estimate = points_of_spectra(recording, largest_relative_sd)
+    if estimate.excitation == "random or steps" and follows_in_row(recording):
+        raise IdentificationError(
+            "u and y move together within a row, as under a controller: y over u is then a mix of the plant and -1/C",
+            where=recording.name,
+            remedy="give the set-point that moved the loop as column r; or move u by hand, the controller off",
+        )  # fmt: skip
+    return estimate
 
 
 def _of_relay(

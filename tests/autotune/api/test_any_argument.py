@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from scipy.signal import lfilter
 
 import autotune as at
 from autotune.errors import AutotuneError
 
 PLANT = at.TransferFunction(num=(2.0,), den=(6.0, 5.0, 1.0))
-SHORT = at.read({"t": np.arange(60) / 10, "u": np.sign(np.sin(np.arange(60) / 5)), "y": np.cos(np.arange(60) / 7)})
+SQUARE = np.sign(np.sin(np.arange(60) / 5))
+SHORT = at.read({"t": np.arange(60) / 10, "u": SQUARE, "y": lfilter([0.0, 0.1], [1.0, -0.9], SQUARE)})
 POINTS = at.Points(at.frequency_points(at.example("oven"), largest_relative_sd=0.05))
 #: what a function takes for its first argument
 FIRST: dict[str, Any] = {

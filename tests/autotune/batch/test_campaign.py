@@ -256,6 +256,13 @@ def test_a_closed_loop_whose_set_point_rests_gives_no_points(tmp_path):
     assert "the set-point never moves" in analyse_loop(work).row.reason
 
 
+def test_a_loop_whose_columns_are_swapped_gives_no_points(tmp_path):
+    t, u, y = signals(0)
+    path = write(tmp_path / "a.csv", {"t": t, "u": y, "y": u})
+    work = Work(loop=LoopSettings(name="a", file=str(path)), settings=CampaignSettings(name="a", task="identify"))
+    assert "u and y seem swapped" in analyse_loop(work).row.reason
+
+
 def test_a_loop_under_control_is_identified_by_subspace(tmp_path):
     rng = np.random.default_rng(0)
     rows, decay = 3000, math.exp(-0.1 / TAU_S)

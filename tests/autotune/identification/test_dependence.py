@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.signal import lfilter
 from typer.testing import CliRunner
 
@@ -12,7 +16,13 @@ import autotune as at
 from autotune.arrays import FloatArray
 from autotune.cli import app
 from autotune.errors import IdentificationError
-from autotune.identification.dependence import dependence, only_follows, recorded_dependence, require_answer
+from autotune.identification.dependence import (
+    dependence,
+    follows_in_row,
+    only_follows,
+    recorded_dependence,
+    require_answer,
+)
 from autotune.recording import Recording, write_recording
 from tests.benchmarks.surrogates import surrogate
 
@@ -127,6 +137,43 @@ def test_the_answer_does_not_hang_on_units_or_the_last_digits(factor: float) -> 
     assert abs(np.log(there.forward) - np.log(here.forward)) < 0.01 * abs(np.log(here.forward))
 
 
+@given(st.floats(-14.0, 14.0), st.floats(-14.0, 14.0))
+@settings(max_examples=8, deadline=None)
+def test_a_model_in_other_units_is_the_same_model(of_u: float, of_y: float) -> None:
+    """From picoamperes in ampere to teraohms in ohm: an output of less than 1e-12 was called constant."""
+    by_u, by_y = 10.0**of_u, 10.0**of_y
+    oven, loop = at.example("oven"), at.example("loop")
+    here, there = at.delay(oven), at.delay(replace(oven, u=by_u * oven.u, y=by_y * oven.y))
+    assert there.delay_s == pytest.approx(here.delay_s, rel=1e-3)
+    assert there.b == pytest.approx(here.b * by_y / by_u, rel=1e-3)
+    other = replace(loop, u=by_u * loop.u, y=by_y * loop.y, extra={"r": by_y * loop["r"]})
+    for fit in (at.frequency_points, partial(at.closed_loop, order=3)):
+        one, two = fit(loop), fit(other)
+        one, two = (found if isinstance(found, tuple) else found.response for found in (one, two))
+        assert [p.response for p in two] == pytest.approx([p.response * by_y / by_u for p in one], rel=1e-3)
+
+
+@pytest.mark.parametrize("gain", [2.0, -2.0])
+@pytest.mark.parametrize("lag", [1.0, 3.0, 30.0])
+def test_a_plant_that_answers_within_a_row_is_no_controller(lag: float, gain: float) -> None:
+    """Rows in which u acted before y was measured, whether the recording says so or not."""
+    keep = float(np.exp(-1.0 / lag))
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        u = moves(rng)["steps"]
+        y = gain * lfilter([1.0 - keep], [1.0, -keep], u - u[0]) + 0.05 * rng.standard_normal(ROWS)
+        open_loop = recorded(u, y)
+        assert not follows_in_row(open_loop)
+        assert not follows_in_row(replace(open_loop, metadata={"hold": "linear"}))
+        assert len(at.frequency_points(open_loop)) > 0
+
+
+def test_under_a_controller_u_follows_y_within_its_row() -> None:
+    for seed in range(10):
+        assert follows_in_row(closed_loop(seed, setpoint=False))
+        assert follows_in_row(closed_loop(seed, setpoint=True))
+
+
 def test_of_a_handful_of_rows_nothing_is_said_but_that_they_are_too_few() -> None:
     few = Recording(t=np.arange(3.0), u=np.array([4.0, 4.0, 6.0]), y=np.array([50.0, 50.0, 51.0]), name="few")
     with pytest.raises(IdentificationError, match="3 rows are too few to tell whether y answers u"):
@@ -139,3 +186,12 @@ def test_no_frequency_points_are_stated_where_y_does_not_answer_u(family: str, t
     done = CliRunner().invoke(app, ["identify", "frequency", f"{tmp_path}/r.csv", "--out", f"{tmp_path}/p.json"])
     assert isinstance(done.exception, IdentificationError)
     assert not (tmp_path / "p.json").exists()
+
+
+@pytest.mark.parametrize("family", ["white", "autoregressive", "random walk", "swapped"])
+@pytest.mark.parametrize(
+    "fit", [at.frequency_points, at.delay, at.closed_loop, partial(at.closed_loop, method="pbsid")]
+)
+def test_no_function_fits_what_does_not_answer(fit: Callable[[Recording], object], family: str) -> None:
+    with pytest.raises(IdentificationError, match=r"nothing to do with u beyond chance|seem swapped"):
+        fit(surrogate(family, 5))
