@@ -34,7 +34,7 @@ def weighed(scores: Mapping[str, float], scale: float, unknown_odds: float) -> t
     weights["unknown"] = unknown_odds * sum(weights.values())
     total = sum(weights.values())
     ranked = sorted(weights.items(), key=lambda item: -item[1])
-    return tuple(Candidate(name=name, probability=w / total) for name, w in ranked if w / total > 1e-4)[:12]
+    return tuple(Candidate(name=name, probability=w / total) for name, w in ranked if w / total > 1e-4)
 
 
 def probability_of(name: str, candidates: Sequence[Candidate]) -> float:

@@ -15,7 +15,7 @@ from autotune.diagnosis.fitting.noise import Noise
 from autotune.diagnosis.fitting.parameters import effect_with, parametrise
 from autotune.diagnosis.fitting.retuning import prepare
 from autotune.diagnosis.selection.prediction import extend
-from autotune.diagnosis.selection.probability import weighed
+from autotune.diagnosis.selection.probability import probability_of, weighed
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
 
@@ -35,6 +35,12 @@ def test_hypotheses_share_the_probability_and_less_evidence_never_weighs_more(
     assert named["unknown"] == pytest.approx(odds / (1.0 + odds), rel=1e-3)
     known = sorted(set(named) - {"unknown"}, key=lambda name: scores[name])
     assert all(named[a] >= named[b] for a, b in itertools.pairwise(known))
+
+
+def test_an_effect_has_the_probability_of_all_hypotheses_that_have_it_however_many_they_are() -> None:
+    fifty = {f"sensor.absolute_value+{name}": 0.1 * k for k, name in enumerate(f"effect_{k}" for k in range(50))}
+    ranked = weighed(fifty, 1.0, 0.25)
+    assert probability_of("sensor.absolute_value", ranked) == pytest.approx(0.8)
 
 
 def test_thinned_data_keep_the_windows_where_a_limit_is_reached() -> None:
