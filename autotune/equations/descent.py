@@ -9,13 +9,14 @@ minimization, arXiv:1201.5885, 2012, section 3: along a narrow curved valley str
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray, deviations_beside_prior
-from autotune.equations.fit_data import FitData, Fitted
+from autotune.equations.fit_data import FitData, Fitted, covered_rows, mean_squares
 from autotune.equations.parameter_scales import linear, slopes_of, values_of
 from autotune.equations.sensitivity import (
     STEP,
@@ -51,40 +52,54 @@ _Derivatives: TypeAlias = tuple[FloatArray, _Back]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Iterate:
-    """Parameters, start states, and the errors that they leave."""
+    """Parameters, start states, what they simulate at every row, and the errors that they leave at those that count."""
 
     z: FloatArray
     windows: list[Windows]
+    runs: list[FloatArray]
     errors: list[FloatArray]
 
 
 class Descent:
     """The iterate of one fit."""
 
-    def __init__(
-        self, compiled: Compiled, data: Sequence[FitData], which: IntArray, z: FloatArray,
-        known: Sequence[Sensitivities] | None = None,
-    ) -> None:  # fmt: skip
-        self._compiled, self._data, self._which, self._z = compiled, list(data), which, z
-        self._known = known  # derivatives at every row of every recording where the descent begins
+    def __init__(self, compiled: Compiled, data: Sequence[FitData], which: IntArray, z: FloatArray) -> None:
+        self._compiled, self._data, self._which = compiled, list(data), which
+        self._known: list[Sensitivities] | None = None  # derivatives at every row of every recording, once they are
         self._free_first = np.flatnonzero(~np.isfinite(stated_starts(compiled)))
         start = values_of(compiled, z)
         scales = [state_scales(compiled, start, one.drive, one.windows.states[0]) for one in data]
         self._scales = np.max(scales, axis=0)
         self._damping, self._firmness = 1e-3, FIRMNESS
         self._last: FloatArray | None = None
-        errors = self._errors_of(z, [one.windows for one in data])
-        if errors is None:
+        begun = self._iterate(z, [one.windows for one in data])
+        if begun is None:
             raise InputError(
                 "the simulation runs away from every start", where=compiled.model.name,
                 remedy="check signs and units, or give horizon_s: an unstable plant is compared as forecasts",
             )  # fmt: skip
-        self._errors = errors
-        self._sd = self._noise(errors)
+        self._at = begun
+        self._sd = self._noise(begun.errors)
 
-    def _errors_of(self, z: FloatArray, windows: Sequence[Windows]) -> list[FloatArray] | None:
-        """Return reading less simulation at the rows that count, None where a run does not reach its end."""
-        found, p = [], values_of(self._compiled, z)
+    def on_fewer_rows(self, good: Sequence[BoolArray]) -> Descent:
+        """Return this descent from where it is with fewer rows that count; what was simulated is not simulated again.
+
+        Parameters
+        ----------
+        good : sequence of (N,) bool arrays
+            Per recording, which rows count; of those that count here.
+        """
+        self._known = self._known or self.sensitivities()
+        other = copy(self)
+        each = list(zip(self._data, good, self._at.errors, strict=True))
+        errors = [e[new[one.good & covered_rows(one.y.size, one.windows)]] for one, new, e in each]
+        other._at, other._sd = replace(self._at, errors=errors), self._noise(errors)
+        other._data = [replace(one, good=new) for one, new, _ in each]
+        return other
+
+    def _iterate(self, z: FloatArray, windows: list[Windows]) -> _Iterate | None:
+        """Return parameters and start states with what they simulate, None where a run does not reach its end."""
+        runs, errors, p = [], [], values_of(self._compiled, z)
         each = list(zip(self._data, windows, strict=True))
 
         def run_of(pair: tuple[FitData, Windows]) -> Run:
@@ -92,13 +107,14 @@ class Descent:
             return run_windows(self._compiled, p, one.drive, w)
 
         rows = sum(int(np.sum(w.stops - w.starts)) for w in windows)
-        runs = side_by_side(run_of, each) if len(each) > 1 and rows > WORTH_A_THREAD else map(run_of, each)
-        for (one, w), run in zip(each, runs, strict=True):
-            error = (one.y - run.y)[one.good & _covered_rows(one.y.size, w)]
+        found = side_by_side(run_of, each) if len(each) > 1 and rows > WORTH_A_THREAD else map(run_of, each)
+        for (one, w), run in zip(each, found, strict=True):
+            error = (one.y - run.y)[one.good & covered_rows(one.y.size, w)]
             if not np.all(np.isfinite(error)):
                 return None
-            found.append(error)
-        return found
+            runs.append(run.y)
+            errors.append(error)
+        return _Iterate(z=z, windows=windows, runs=runs, errors=errors)
 
     @staticmethod
     def _noise(errors: Sequence[FloatArray]) -> float:
@@ -106,14 +122,14 @@ class Descent:
 
     def _derivatives(self) -> list[_Derivatives]:
         """Return per recording J to z with the start states projected out, and per window what gives those back."""
-        per_z = slopes_of(self._compiled, self._z)
+        per_z = slopes_of(self._compiled, self._at.z)
         known, self._known = self._known or self.sensitivities(), None
         return [self._project_windows(one, s, per_z) for one, s in zip(self._data, known, strict=True)]
 
     def sensitivities(self) -> list[Sensitivities]:
         """Return the derivatives of every recording's readings at the iterate."""
         compiled = self._compiled
-        p = values_of(compiled, self._z)
+        p = values_of(compiled, self._at.z)
         spread = np.array([q.spread for q in compiled.parameters])
         steps = STEP * np.maximum(np.abs(p), np.abs(np.where(linear(compiled), spread, p * spread)))
         steps = np.where(steps > 0.0, steps, STEP)
@@ -127,7 +143,9 @@ class Descent:
 
     def simulated(self, drives: Sequence[Drive] | None = None) -> list[FloatArray]:
         """Return y at every row of every recording, of other drives if given; NaN from where a simulation runs away."""
-        p = values_of(self._compiled, self._z)
+        if drives is None and self._at.runs:
+            return self._at.runs
+        p = values_of(self._compiled, self._at.z)
         each = zip(self._data, drives or [one.drive for one in self._data], strict=True)
         return [run_windows(self._compiled, p, drive, one.windows).y for one, drive in each]
 
@@ -165,7 +183,7 @@ class Descent:
             if previous - cost < max(WORTH_MOVING * gained, _SMALL * previous):
                 break
             gained = previous - cost
-        self._sd = self._noise(self._errors)
+        self._sd = self._noise(self._at.errors)
         return bool(before - cost < _SMALL * before)
 
     def _attempt_move(self, derivatives: Sequence[_Derivatives], tries: int) -> bool:
@@ -179,14 +197,14 @@ class Descent:
         backs, before = [back for _, back in derivatives], self._cost()
         for k in range(tries):
             damping = self._damping * np.diag(np.diag(H))
-            at = _Iterate(z=self._z, windows=[one.windows for one in self._data], errors=self._errors)
+            at = self._at
             foreseen = np.zeros(self._which.size)
             for _ in range(2):
                 new = self._next(at, J, H + damping, backs, foreseen)
                 if new is None:
                     break
                 if self._cost_of(new.errors, new.z) < before:
-                    self._z, self._errors = new.z, new.errors
+                    self._at = new
                     self._data = [replace(one, windows=w) for one, w in zip(self._data, new.windows, strict=True)]
                     self._damping = max(self._damping * 0.2, 1e-9)
                     self._firmness = max(self._firmness / FIRMER, FIRMNESS)
@@ -211,11 +229,10 @@ class Descent:
         new_z[self._which] += np.clip(move, -3.0, 3.0)
         each = zip(at.windows, backs, at.errors, strict=True)
         windows = [self._move_starts(w, back, error, new_z[self._which] - z) for w, back, error in each]
-        errors = self._errors_of(new_z, windows)
-        return None if errors is None else _Iterate(z=new_z, windows=windows, errors=errors)
+        return self._iterate(new_z, windows)
 
     def _cost(self) -> float:
-        return self._cost_of(self._errors, self._z)
+        return self._cost_of(self._at.errors, self._at.z)
 
     def _cost_of(self, errors: Sequence[FloatArray], z: FloatArray) -> float:
         e = np.concatenate(list(errors)) / self._sd
@@ -237,7 +254,8 @@ class Descent:
 
         A start state that made up for wrong numbers may lead to another swing than the right one, for good.
         """
-        p, before = values_of(self._compiled, self._z), [self._mean_squares(one, one.windows) for one in self._data]
+        p, runs = values_of(self._compiled, self._at.z), self.simulated()
+        before = [mean_squares(one, one.windows, y) for one, y in zip(self._data, runs, strict=True)]
         known = np.concatenate(before)
         if known.size < LEAST_WINDOWS or not np.any(known > STANDS_OUT * np.median(known)):
             return False
@@ -250,45 +268,31 @@ class Descent:
         ]
         found = False
         for i, (one, new, old) in enumerate(zip(self._data, windows, before, strict=True)):
-            better = self._mean_squares(one, new) < RESTARTED * old
+            better = mean_squares(one, new, run_windows(self._compiled, p, one.drive, new).y) < RESTARTED * old
             states = np.where(better[:, None], new.states, one.windows.states)
             self._data[i] = replace(one, windows=replace(one.windows, states=states))
             found = found or bool(better.any())
-        errors = self._errors_of(self._z, [one.windows for one in self._data]) if found else None
-        self._errors = self._errors if errors is None else errors
+        windows = [one.windows for one in self._data]
+        if found:  # where a run no longer reaches its end its errors stay, and it is simulated where it is asked for
+            self._at = self._iterate(self._at.z, windows) or replace(self._at, windows=windows, runs=[])
         return found
-
-    def _mean_squares(self, one: FitData, w: Windows) -> FloatArray:
-        """Return the mean square that each window leaves; infinite where it runs away."""
-        p = values_of(self._compiled, self._z)
-        e = one.y - run_windows(self._compiled, p, one.drive, w).y
-        parts = (e[a:b][one.good[a:b]] for a, b in zip(w.starts, w.stops, strict=True))
-        found = [float(np.mean(part**2)) if part.size else 0.0 for part in parts]
-        return np.where(np.isfinite(found), found, np.inf)
 
     def fitted(self) -> Fitted:
         """Return what was found."""
-        compiled, p = self._compiled, values_of(self._compiled, self._z)
+        compiled, p = self._compiled, values_of(self._compiled, self._at.z)
         if self._last is None:
             self._last = np.vstack([part for part, _ in self._derivatives()])
         J = self._last / self._sd
-        per_z = np.abs(slopes_of(compiled, self._z))
+        per_z = np.abs(slopes_of(compiled, self._at.z))
         sd, whole = np.zeros(p.size), np.zeros((J.shape[0], p.size))
         sd[self._which] = deviations_beside_prior(J) * per_z[self._which]
         whole[:, self._which] = J
         simulated = tuple(self.simulated())
         residuals = tuple(np.where(one.good, one.y - y, np.nan) for one, y in zip(self._data, simulated, strict=True))
         return Fitted(
-            compiled=compiled, parameters=p, sd=sd, z=self._z, windows=tuple(one.windows for one in self._data),
+            compiled=compiled, parameters=p, sd=sd, z=self._at.z, windows=tuple(one.windows for one in self._data),
             simulated=simulated, residuals=residuals, noise_sd=self._sd, jacobian=whole,
         )  # fmt: skip
-
-
-def _covered_rows(rows: int, windows: Windows) -> BoolArray:
-    covered = np.zeros(rows, dtype=bool)
-    for a, b in zip(windows.starts, windows.stops, strict=True):
-        covered[a:b] = True
-    return covered
 
 
 def _project_error(back: _Back, error: FloatArray) -> FloatArray:

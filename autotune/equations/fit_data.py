@@ -126,3 +126,42 @@ def data_of(
         starts, stops = starts[read], stops[read]
         windows = fit_starts(compiled, parameters, drive, recording.y, good, starts, stops, known=known)
     return FitData(drive=drive, y=recording.y, good=good, windows=windows)
+
+
+def mean_squares(one: FitData, w: Windows, y: FloatArray) -> FloatArray:
+    """Return the mean square that each window leaves of what was simulated; infinite where it runs away.
+
+    Parameters
+    ----------
+    one : FitData
+        A recording of N rows.
+    w : Windows
+        W windows of it.
+    y : (N,) array
+        What was simulated on them [y unit].
+
+    Returns
+    -------
+    (W,) array
+        In the reading's unit squared.
+    """
+    e = one.y - y
+    parts = (e[a:b][one.good[a:b]] for a, b in zip(w.starts, w.stops, strict=True))
+    found = [float(np.mean(part**2)) if part.size else 0.0 for part in parts]
+    return np.where(np.isfinite(found), found, np.inf)
+
+
+def covered_rows(rows: int, w: Windows) -> BoolArray:
+    """Return which of so many rows lie in a window, a bool array of that length.
+
+    Parameters
+    ----------
+    rows : int
+        Rows of the recording.
+    w : Windows
+        Windows of it.
+    """
+    covered = np.zeros(rows, dtype=bool)
+    for a, b in zip(w.starts, w.stops, strict=True):
+        covered[a:b] = True
+    return covered

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from autotune.diagnosis.evidence.stretches import STRETCHES, cuttings_in
-from autotune.equations import Drive, EquationModel, compile_model, fit, simulate
+from autotune.equations import Drive, EquationModel, compile_model, descent, fit, simulate
+from autotune.equations.descent import Descent
+from autotune.equations.fit_data import data_of
 from autotune.equations.left_out import left_out_squares
+from autotune.equations.sensitivity import run_windows
+from autotune.equations.simulate import Run
 from autotune.recording import Recording
 from tests.autotune.equations.models import one_state
 
@@ -45,6 +51,36 @@ def test_the_true_model_leaves_the_noise_where_it_was_not_fitted(pair: list[Reco
 
 def test_stretches_speak_for_the_true_model(pair: list[Recording]) -> None:
     assert np.sum(np.log(squares(LINEAR, pair)[0] / squares(ROOT, pair)[0])) > 12.0
+
+
+def test_a_stretch_that_is_left_out_costs_the_simulations_of_its_move_alone(
+    pair: list[Recording], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = fit(compile_model(ROOT), pair, horizon_s=15.0)
+    labels = [np.arange(ROWS) // 300 for _ in pair]
+    runs: list[object] = []
+
+    def counted(*given: object, **named: object) -> Run:
+        runs.append(given)
+        return run_windows(*given, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(descent, "run_windows", counted)
+    left_out_squares(found, pair, labels, 3)
+    assert len(pair) * 3 < len(runs) <= len(pair) * (1 + 2 * 3)
+
+
+def test_a_descent_on_fewer_rows_is_that_of_these_rows(pair: list[Recording]) -> None:
+    compiled = compile_model(ROOT)
+    data, which = [data_of(compiled, r, compiled.parameter_vector, 15.0, None) for r in pair], np.arange(2)
+    fewer = [one.good & (np.arange(ROWS) >= 200) for one in data]
+    own = Descent(
+        compiled, [replace(one, good=good) for one, good in zip(data, fewer, strict=True)], which, np.zeros(2)
+    )
+    derived = Descent(compiled, data, which, np.zeros(2)).on_fewer_rows(fewer)
+    for one in (own, derived):
+        one.step()
+    assert np.array_equal(own.fitted().z, derived.fitted().z)
+    assert np.array_equal(own.simulated(), derived.simulated())
 
 
 def test_what_tells_of_nothing_else_is_judged_as_unseen() -> None:
