@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -65,30 +64,23 @@ def warn_of_no_dead_man(config: Config) -> str:
     )
 
 
-def count_compiled() -> tuple[Path, int]:
-    """Return the folder in which compiled functions are kept, and how many of this Python are there.
-
-    Returns
-    -------
-    folder : Path
-        The one that the environment names, else the package's own.
-    kept : int
-        Number of functions.
-    """
-    import autotune
-
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    folder = Path(given) if given else Path(autotune.__file__).parent
-    of_this = f"*.py{sys.version_info.major}{sys.version_info.minor}*.nbi"
-    return folder, sum(1 for _ in folder.rglob(of_this)) if folder.is_dir() else 0
-
-
+@cache
 def announce_compiling() -> None:
-    """Say why the first call after an installation takes so long, before it does."""
-    folder, kept = count_compiled()
-    # where the package cannot be written the compiler keeps its code elsewhere, and nothing is known of it
-    if not kept and (os.environ.get("NUMBA_CACHE_DIR") or os.access(folder, os.W_OK)):
-        typer.echo("note: compiling, once after an installation: about half a minute", err=True)
+    """Say, once, that inner loops are compiled, when the first of them is: why a command is silent for seconds."""
+    from numba.core import event
+
+    class Announcement(event.Listener):  # type: ignore[misc]
+        said = False
+
+        def on_start(self, _: event.Event) -> None:
+            if not self.said:
+                self.said = True
+                typer.echo("note: compiling, once after an installation: up to half a minute", err=True)
+
+        def on_end(self, _: event.Event) -> None:
+            """Nothing is said of the end."""
+
+    event.register("numba:compile", Announcement())
 
 
 OVERWRITE = Annotated[bool, typer.Option("--overwrite", help="replace what is at --out; an input never is")]

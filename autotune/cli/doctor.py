@@ -6,6 +6,7 @@ import os
 import platform
 import shutil
 import socket
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ import typer
 from rich.console import Console
 
 from autotune.cli import app
-from autotune.cli.common import count_compiled, warn_of_no_dead_man
+from autotune.cli.common import warn_of_no_dead_man
 from autotune.errors import InputError
 
 if TYPE_CHECKING:
@@ -143,10 +144,14 @@ def _extra() -> Check:
 
 def _check_compiled() -> Check:
     """Say whether the inner loops are compiled already, and whether they can be kept."""
-    own, kept = count_compiled()
+    import autotune
+
+    given, of_this = os.environ.get("NUMBA_CACHE_DIR"), f"*.py{sys.version_info.major}{sys.version_info.minor}*.nbi"
+    own = Path(given) if given else Path(autotune.__file__).parent
+    kept = sum(1 for _ in own.rglob(of_this)) if own.is_dir() else 0
     subject = "compiled code"
     # where the package cannot be written the compiler keeps its code in the user's cache folder
-    places = [own] if os.environ.get("NUMBA_CACHE_DIR") else [own, Path.home()]
+    places = [own] if given else [own, Path.home()]
     if not any(os.access(place, os.W_OK) for place in places):
         remedy = "set NUMBA_CACHE_DIR to a folder you may write; every run compiles for about half a minute otherwise"
         return Check(subject=subject, found=f"cannot be kept in {places[0]}", verdict="note", remedy=remedy)
