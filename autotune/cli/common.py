@@ -75,7 +75,8 @@ def announce_compiling() -> None:
         def on_start(self, _: event.Event) -> None:
             if not self.said:
                 self.said = True
-                typer.echo("note: compiling, once after an installation or for a new model: up to half a minute", err=True)
+                when = "once after an installation or for a new model"
+                typer.echo(f"note: compiling, {when}: up to half a minute", err=True)
 
         def on_end(self, _: event.Event) -> None:
             """Nothing is said of the end."""
