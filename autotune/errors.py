@@ -8,6 +8,8 @@ operator).
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
+from functools import partial
 from typing import ClassVar
 
 
@@ -31,6 +33,10 @@ class AutotuneError(Exception):
         self.what = what
         self.where = where
         self.remedy = remedy
+
+    def __reduce__(self) -> tuple[Callable[[str], AutotuneError], tuple[str]]:
+        """Return what makes it again in another process."""
+        return partial(type(self), where=self.where, remedy=self.remedy), (self.what,)
 
     def __str__(self) -> str:
         head = f"{self.where}: {self.what}" if self.where else self.what

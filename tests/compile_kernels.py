@@ -55,7 +55,8 @@ def compile_identification() -> None:
     r = np.repeat(np.random.default_rng(1).choice([-1.0, 1.0], 20), 10)
     loop = at.example("loop")
     at.closed_loop(loop, 2)
-    at.delay({**record, "u": r, "y": np.convolve(r, np.exp(-0.1 * np.arange(200)))[:200]}, 1, method="online")
+    answer = np.concatenate([[0.0], np.convolve(r, np.exp(-0.1 * np.arange(200)))[:199]])
+    at.delay({**record, "u": r, "y": answer}, 1, method="online")
 
 
 def compile_diagnosis() -> None:
