@@ -37,6 +37,8 @@ _THIN = 4
 _STARTS, _APART = 2, 0.25
 #: where no node is kept: so many are looked at, and the best of them led towards what is asked for, a little inside
 _LOOKED, _LED, _INSIDE = 300, 3, 0.002
+#: a search begins anew from where it came to, so often at most, until the norm (log) changes by less
+_RESTARTS, _SETTLED = 6, 1e-4
 #: slope of the wall that a simplex meets at a constraint, norm (log) per relative slack
 _WALL = 1e4
 
@@ -152,8 +154,12 @@ def _search_structure(plant: UncertainPlant, specification: Specification, kind:
     near = [_simplex(coarse, specification, starts[0], 0.3)] if kind == "pi" else starts
     found = [_quadratic(coarse, specification, start, (1.0, 0.1)) for start in near]
     best = min(found, key=lambda p: _norm(coarse, p))
-    fine = _simplex(plant, specification, best, 0.1) if kind == "pi" else best
-    best = _quadratic(plant, specification, fine, (0.1,), best)
+    for _ in range(_RESTARTS if kind == "pi" else 1):  # a kink may hold a simplex, but hardly a new one around it
+        before = _norm(plant, best)
+        near_best = _simplex(plant, specification, best, 0.1) if kind == "pi" else best
+        best = _quadratic(plant, specification, near_best, (0.1,), best)
+        if abs(before - _norm(plant, best)) < _SETTLED:
+            break
     if np.min(_slacks(plant, specification, best)) < -1e-6:  # feasible between the coarse frequencies only
         best = _quadratic(plant, specification, _inwards(plant, specification, starts[0]), (1.0, 0.1))
     if np.min(_slacks(plant, specification, best)) < -1e-6:
