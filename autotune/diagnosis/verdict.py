@@ -106,7 +106,7 @@ class Evidence(ABC):
     def candidates(self) -> tuple[Candidate, ...]:
         """Every hypothesis with its probability by all rows, best first."""
         if self.found is None:
-            return weighed({"none": 0.0}, 1.0, self.unknown_odds)
+            return weighed({"none": 0.0}, self.unknown_odds)
         unknown = self.unknown_odds if self.residual.is_noise else self.limits.unknown_odds
         return probabilities(self.found.judged, self.found.best, unknown)
 

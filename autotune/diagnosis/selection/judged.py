@@ -148,11 +148,11 @@ class Judged(ABC):
         """
         return STRETCHES * (self.log_squares - other.log_squares) / self.limits.temperature
 
-    def is_better(self, other: Judged, share: float) -> bool:
-        """Whether it takes a share of another one's held-out error away; near the noise, whether rows speak for it."""
+    def is_better(self, other: Judged) -> bool:
+        """Whether it takes what matters of another one's held-out error away; near the noise, what rows speak for."""
         if self.leaves_noise or other.leaves_noise:
             return other.behind(self) > 0.0
-        return math.exp(0.5 * (self.log_squares - other.log_squares)) < 1.0 - share
+        return math.exp(0.5 * (self.log_squares - other.log_squares)) < 1.0 - self.limits.material
 
 
 _J = TypeVar("_J", bound=Judged)
@@ -228,7 +228,7 @@ def probabilities(found: Sequence[_J], best: _J, unknown_odds: float) -> tuple[C
         rivals = [other for other in found if other.identity != one.identity]
         scores[_title(one)] = min(scores.get(_title(one), math.inf), max(worst(one, rivals), 0.0))
     scores[_title(best)] = min(scores.values())
-    return weighed(scores, 1.0, unknown_odds)
+    return weighed(scores, unknown_odds)
 
 
 def _title(one: Judged) -> str:

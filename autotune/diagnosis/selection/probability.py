@@ -17,20 +17,18 @@ class Candidate:
     probability: float
 
 
-def weighed(scores: Mapping[str, float], scale: float, unknown_odds: float) -> tuple[Candidate, ...]:
+def weighed(scores: Mapping[str, float], unknown_odds: float) -> tuple[Candidate, ...]:
     """Return probabilities of hypotheses from their scores, best first, a cause that is none of them included.
 
     Parameters
     ----------
     scores : mapping
-        Penalised chi-square by name; twice a log-likelihood where noise is ideal.
-    scale : float
-        Units of it that count as one.
+        Twice the logarithm of the odds against each, by name.
     unknown_odds : float
         Prior odds of what is none of them, beside 1 of all together.
     """
     best = min(scores.values())
-    weights = {name: math.exp(-(value - best) / (2.0 * scale)) for name, value in scores.items()}
+    weights = {name: math.exp(-0.5 * (value - best)) for name, value in scores.items()}
     weights["unknown"] = unknown_odds * sum(weights.values())
     total = sum(weights.values())
     ranked = sorted(weights.items(), key=lambda item: -item[1])

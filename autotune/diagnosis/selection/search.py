@@ -157,7 +157,7 @@ def _grow(at: Proposals[_J], progress: Progress) -> tuple[Proposals[_J], list[_J
         leads = ranked[0] is not best
         ranked.remove(best)
         beam = built_on(ranked, limits.followed)
-        if leads and ranked[0].is_better(best, limits.material):
+        if leads and ranked[0].is_better(best):
             best = ranked[0]
             at = at.beside(best)
             beam = [at.again(j) for j in beam if j.leaves_noise or not best.leaves_noise]

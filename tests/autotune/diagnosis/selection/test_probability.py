@@ -22,13 +22,12 @@ from autotune.recording import Recording
 
 @given(
     scores=st.dictionaries(st.sampled_from("abcdef"), st.floats(0.0, 200.0), min_size=1),
-    scale=st.floats(1.0, 10.0),
     odds=st.floats(0.001, 1.0),
 )
 def test_hypotheses_share_the_probability_and_less_evidence_never_weighs_more(
-    scores: dict[str, float], scale: float, odds: float
+    scores: dict[str, float], odds: float
 ) -> None:
-    ranked = weighed(scores, scale, odds)
+    ranked = weighed(scores, odds)
     named = {c.name: c.probability for c in ranked}
     assert sum(named.values()) == pytest.approx(1.0, abs=1e-3)
     # prior odds beside 1 of all hypotheses together, however many share that 1
@@ -39,7 +38,7 @@ def test_hypotheses_share_the_probability_and_less_evidence_never_weighs_more(
 
 def test_an_effect_has_the_probability_of_all_hypotheses_that_have_it_however_many_they_are() -> None:
     fifty = {f"sensor.absolute_value+{name}": 0.1 * k for k, name in enumerate(f"effect_{k}" for k in range(50))}
-    ranked = weighed(fifty, 1.0, 0.25)
+    ranked = weighed(fifty, 0.25)
     assert probability_of("sensor.absolute_value", ranked) == pytest.approx(0.8)
 
 
