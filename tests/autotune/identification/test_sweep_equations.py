@@ -30,6 +30,13 @@ def under_a_command_that_clips(seed: int) -> DelayData:
     return prepare(Recording(t=t, u=u, y=y + rng.normal(0.0, 0.003, t.size)), start_s=0.3, past_input="held")
 
 
+def begun_off(data: DelayData) -> Fitted:
+    """Return an equation of order 4 whose numbers are far from the rows."""
+    structure = Structure(order=4, zeros=1)
+    begun = solve_linear(data, structure, (-2000.0, -3000.0, -600.0, -60.0), 0.02)
+    return Fitted(structure=structure, point=begun, covariance=np.empty((0, 0)), places=1)
+
+
 def test_the_search_for_a_dead_time_ends_with_the_rows_of_which_it_may_be(monkeypatch: pytest.MonkeyPatch) -> None:
     """It crept on, a little lower each time and no row further: 91 descents where there are 8 steps to the limit."""
     data, longest_s = under_a_command_that_clips(seed=5), 0.3
@@ -40,10 +47,15 @@ def test_the_search_for_a_dead_time_ends_with_the_rows_of_which_it_may_be(monkey
         return descents[-1]
 
     monkeypatch.setattr(sweep_equations, "minimise", counted)
-    structure, white = Structure(order=4, zeros=1), np.empty(0)
-    begun = solve_linear(data, structure, (-2000.0, -3000.0, -600.0, -60.0), 0.02)
-    start = Fitted(structure=structure, point=begun, covariance=np.empty((0, 0)), places=1)
-    with suppress(IdentificationError):  # whether the rows determine what no equation describes hangs on rounding
-        fit_again(data, [start], longest_s, white)
-    assert min(point.cost for point in descents) < begun.cost
+    start = begun_off(data)
+    with suppress(IdentificationError):  # whether these rows determine what no equation describes hangs on rounding
+        fit_again(data, [start], longest_s, np.empty(0))
+    assert min(point.cost for point in descents) < start.point.cost
     assert 3 < len(descents) <= 3 + longest_s / STEP_S
+
+
+def test_an_equation_that_its_rows_determine_is_fitted_lower_than_it_began() -> None:
+    data = under_a_command_that_clips(seed=6)
+    start = begun_off(data)
+    (found,) = fit_again(data, [start], 0.3, np.empty(0))
+    assert found.point.cost < start.point.cost
