@@ -115,6 +115,11 @@ class Recording:
         return float(np.median(np.diff(self.t)))
 
     @property
+    def stated_sample_time_s(self) -> float:
+        """Sample time as the recording's metadata state it, else the median step [s]."""
+        return float(self.metadata.get("sample_time_s", self.sample_time_s))
+
+    @property
     def duration_s(self) -> float:
         """Time from the first row to the end of the last row's hold [s]."""
         return float(self.t[-1] - self.t[0]) + self.sample_time_s

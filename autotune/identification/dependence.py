@@ -119,8 +119,10 @@ def _of_columns(recording: Recording) -> Dependence:
 
 def _moving_setpoint(recording: Recording) -> FloatArray | None:
     """Return r, its gaps bridged, where it was recorded and moves."""
-    r = recording.extra.get("r")
-    return None if r is None or is_constant(_bridge(r)) else _bridge(r)
+    if (r := recording.extra.get("r")) is None:
+        return None
+    bridged = _bridge(r)
+    return None if is_constant(bridged) else bridged
 
 
 def require_order(recordings: Sequence[Recording]) -> None:

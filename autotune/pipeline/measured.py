@@ -113,5 +113,5 @@ def _facts(recordings: Sequence[Recording]) -> LoopFacts:
         noise_sd=float(np.median([noise_of(one.y) for one in recordings])),
         u_span=max(float(np.ptp(one.u)) for one in recordings),
         # as it is stated: the last digit of a difference of times has moved a controller
-        sample_time_s=max(float(one.metadata.get("sample_time_s", one.sample_time_s)) for one in recordings),
+        sample_time_s=max(one.stated_sample_time_s for one in recordings),
     )

@@ -90,7 +90,7 @@ def read_noted_windows(recording: Recording) -> tuple[Windowed, ...]:
     tables = recording.metadata.get("relay")
     if not isinstance(tables, list):
         return ()
-    sample_time_s = float(recording.metadata.get("sample_time_s", recording.sample_time_s))
+    sample_time_s = recording.stated_sample_time_s
     rows = recording.t, recording.u, recording.y
     try:
         windows = [
