@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -328,31 +329,44 @@ def delay(
     if not isinstance(delays, int) or isinstance(delays, bool) or delays not in (1, 2):
         raise InputError(f"delays = {delays!r}", where="delay", remedy="1, or 2 for x'' + a x(t - h_1) = b u(t - h_2)")
     record = read(recording)
-    if delays == 2:
-        from autotune.identification.delay.two_delays import intervals_of, two_delays
+    fit = _fit_two_delays(interval_s, settings) if delays == 2 else _fit_delay(way, order, interval_s, settings)
+    require_answer([record])  # after the settings, which are refused first
+    return fit(record)
 
-        asked = settings_of(two_delays, settings, where="delay, delays = 2")
-        require_answer([record])
-        return two_delays(record, intervals_of(record, interval_s), **asked)
+
+def _fit_two_delays(interval_s: float | None, settings: dict[str, Any]) -> Callable[[Recording], TwoDelays]:
+    """Return the fit of two dead times, its settings checked."""
+    from autotune.identification.delay.two_delays import intervals_of, two_delays
+
+    asked = settings_of(two_delays, settings, where="delay, delays = 2")
+    return lambda record: two_delays(record, intervals_of(record, interval_s), **asked)
+
+
+def _fit_delay(
+    way: str, order: int, interval_s: float | None, settings: dict[str, Any]
+) -> Callable[[Recording], DelayModel]:
+    """Return the fit of one dead time by a method, its settings checked."""
     if way == "output-error":
         from autotune.identification.delay.identify import identify_delay
 
         if interval_s is not None:
             raise InputError("interval_s is of the modulating functions", where="delay", remedy='method="algebraic"')
         asked = settings_of(identify_delay, settings, where="delay")
-        require_answer([record])
-        return identify_delay(record, order, **asked)
+        return lambda record: identify_delay(record, order, **asked)
     from autotune.identification.delay.methods import algebraic_delay, online_delay
 
     if way == "algebraic":
         asked = settings_of(algebraic_delay, {"interval_s": interval_s, **settings}, where="delay, algebraic")
-        require_answer([record])
-        return algebraic_delay(record, order, **asked)
+        return lambda record: algebraic_delay(record, order, **asked)
     asked = settings_of(online_delay, settings, where="delay, online")
-    require_answer([record])
-    if "start_s" not in asked:
-        asked["start_s"] = algebraic_delay(record, order, interval_s=interval_s).delay_s
-    return online_delay(record, order, **asked)
+
+    def fit_online(record: Recording) -> DelayModel:
+        if "start_s" in asked:
+            return online_delay(record, order, **asked)
+        start_s = algebraic_delay(record, order, interval_s=interval_s).delay_s
+        return online_delay(record, order, start_s=start_s, **asked)
+
+    return fit_online
 
 
 def closed_loop(
@@ -391,7 +405,9 @@ def closed_loop(
     >>> len(loop.poles)
     5
     """
+    from autotune.identification.closed_loop.identify import identify_closed_loop
     from autotune.identification.closed_loop.methods import METHODS, Windows
+    from autotune.identification.closed_loop.signals import model_of_recording
     from autotune.identification.dependence import require_answer
 
     way = one_of(method, METHODS, name="method", where="closed_loop")
@@ -403,17 +419,17 @@ def closed_loop(
         )
     record = read(recording)
     law = None if controller is None else as_controller(controller)
+    fit: Callable[[], ClosedLoopIdentification | InnovationModel]
     if way == "prediction-error" and not any(more):
-        from autotune.identification.closed_loop.identify import identify_closed_loop
-
         asked = settings_of(identify_closed_loop, settings, where="closed_loop")
-        require_answer([record])
-        return identify_closed_loop(record, order=order, controller=law, **asked)
-    from autotune.identification.closed_loop.signals import model_of_recording
-
-    windows = Windows(**settings_of(Windows, settings, where=f"closed_loop, {way}"))
-    require_answer([record])
-    return model_of_recording(record, method=way, order=order, controller=law, more=more, windows=windows)
+        fit = partial(identify_closed_loop, record, order=order, controller=law, **asked)
+    else:
+        windows = Windows(**settings_of(Windows, settings, where=f"closed_loop, {way}"))
+        fit = partial(
+            model_of_recording, record, method=way, order=order, controller=law, more=more, windows=windows
+        )  # fmt: skip
+    require_answer([record])  # after the settings, which are refused first
+    return fit()
 
 
 def _are_names(value: Any) -> bool:
