@@ -33,6 +33,10 @@ from autotune.identification.delay.propagation import (
     schedule,
 )
 
+#: A sum of squares is what y has less what is explained, but below this share of y's, where that difference has lost
+#: its digits: there the residuals are squared themselves.
+_DIFFERENCE_TOLD = 1e-8
+
 
 def normal_matrix(
     data: DelayData,
@@ -228,6 +232,10 @@ def linear_part(
     theta = np.zeros(2 + len(a) + zeros)
     gram, finite = normal_matrix(data, a, h, theta, False, whitening)
     cost = _least_squares(gram, offset, theta) if finite else np.inf
+    total = gram[-1, -1]
+    if cost < _DIFFERENCE_TOLD * total:
+        gram, finite = normal_matrix(data, a, h, theta, True, whitening)
+        cost = max(float(gram[-1, -1]), np.finfo(float).eps ** 2 * total) if finite else np.inf
     return theta, cost
 
 
@@ -241,5 +249,4 @@ def _least_squares(gram: FloatArray, offset: bool, theta: FloatArray) -> float:
         return np.inf
     for i in range(free.size):
         theta[free[i]] = solution[i]
-    total = gram[size, size]
-    return float(max(total - explained, 1e-15 * total))
+    return float(gram[size, size] - explained)

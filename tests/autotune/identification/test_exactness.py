@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import Phase, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 from scipy.signal import cont2discrete, lfilter
 
@@ -47,6 +47,9 @@ def held_record(a: tuple[float, ...], b: float, delay_s: float, level: tuple[flo
     delay_s=st.floats(0.0, 1.5),
     level=st.tuples(st.floats(-50.0, 50.0), st.floats(-50.0, 50.0)),
     seed=st.integers(0, 99),
+)
+@example(  # without delay the sum of squares falls below the rounding of y's own
+    method="output-error", lags=(1.1427755609229207, 2.0727863976901806), delay_s=0.0, level=(41.85, -35.61), seed=73
 )
 def test_delays(method: str, lags: tuple[float, float], delay_s: float, level: tuple[float, float], seed: int) -> None:
     one, two = lags
