@@ -72,7 +72,7 @@ def evidence_of(
     def beside(result: Fit, data: Data) -> list[SampleEffect]:
         jitter, law = late, law_effect(recordings, controller, thresholds)
         if jitter is None and JITTER not in (*without, *_excluded(seen)):
-            jitter = jitter_effect(result, data, recordings)
+            jitter = jitter_effect(result, data)
         return [s for s in (jitter, law) if s is not None and (s is late or s.name not in without)]
 
     retuned, data = near.retuned.fit, near.data

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from autotune.arrays import FloatArray
@@ -13,13 +11,12 @@ from autotune.diagnosis.evidence.samples import JITTER, SampleEffect
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.models import Parameter
-from autotune.recording import Recording
 
 #: Times that slope and weights are estimated in turn, and means of the squares at which single ones are cut.
 TURNS, LARGEST = 3, 20.0
 
 
-def jitter_effect(result: Fit, data: Data, recordings: Sequence[Recording]) -> SampleEffect | None:
+def jitter_effect(result: Fit, data: Data) -> SampleEffect | None:
     """Return timing jitter where the residual's variance grows with the output's squared slope.
 
     Parameters
@@ -28,15 +25,13 @@ def jitter_effect(result: Fit, data: Data, recordings: Sequence[Recording]) -> S
         A fit at its minimum.
     data : Data
         What it was fitted to.
-    recordings : sequence of Recording
-        All rows of what was measured.
 
     Notes
     -----
     A stamp that is wrong by d adds d dy/dt to the reading: Var e = s^2 + d_sd^2 (dy/dt)^2. It disturbs single rows;
     what goes with a signal grows with the slope as well, so that nothing else may explain more of the residual.
     """
-    x, z = _squares(result, recordings)
+    x, z = _squares(result, data)
     level = float(np.median(z)) / 0.455
     if level <= 0.0 or float(np.ptp(x)) == 0.0:
         return None
@@ -61,15 +56,17 @@ def jitter_effect(result: Fit, data: Data, recordings: Sequence[Recording]) -> S
     )
 
 
-def _squares(result: Fit, recordings: Sequence[Recording]) -> tuple[FloatArray, FloatArray]:
+def _squares(result: Fit, data: Data) -> tuple[FloatArray, FloatArray]:
     """Return the reading's squared slope and the residual's square, of its fast part, at all rows that count.
 
-    What is missing and slow grows with the slope.
+    What is missing and slow grows with the slope. A row's neighbours count as well: of a long recording windows are
+    left out, and no difference reaches across them.
     """
     slopes, squares = [], []
-    for r, e, out in zip(recordings, result.residuals, result.signals, strict=True):
+    for r, e, out in zip(data.recordings, result.residuals, result.signals, strict=True):
         slope = np.gradient(out[:, 0], r.t)
         use = (e != 0.0) & np.isfinite(slope)
+        use[1:-1] &= (e[2:] != 0.0) & (e[:-2] != 0.0)
         slopes.append(slope[use] ** 2)
         fast = np.zeros_like(e)
         fast[1:-1] = (e[1:-1] - 0.5 * (e[:-2] + e[2:])) / np.sqrt(1.5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from autotune.diagnosis.evidence.samples import inspect
 from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.retuning import prepare
 from autotune.diagnosis.simulation.forecast import forecast
+from autotune.diagnosis.thresholds import IN_USE
 from autotune.effects import CATALOGUE
 from autotune.experiment_design import with_next_experiment
 from autotune.model_tables import read_model
@@ -65,6 +67,13 @@ def test_wrong_numbers_are_called_parameters_and_the_extended_model_has_the_righ
     assert found.effects == ()
     gain = found.extended_model.blocks[0].dynamics.num[0]
     assert gain == pytest.approx(5.4, rel=0.01)
+
+
+def test_a_recording_that_is_retuned_in_some_of_its_windows_is_diagnosed() -> None:
+    limits = replace(IN_USE, searched_rows=400, rig_rows=400)
+    others = [n for n in CATALOGUE if n != "plant.quadratic_drag"]
+    found = diagnose(servo(), [rig(1, drag=0.12)], without=others, thresholds=limits)
+    assert [e.name for e in found.effects] == ["plant.quadratic_drag"]
 
 
 def test_a_drag_left_out_is_named_with_its_coefficient() -> None:
