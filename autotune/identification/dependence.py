@@ -52,7 +52,7 @@ class Dependence:
         Of u to what y was in earlier rows: a feedback, or a swapped pair.
     same_row : float
         Of the two innovations in one row, in standard deviations: a controller's, since y is measured before u acts; 0
-        where u acted before, as ``first_lag`` 0 says or y, which goes on in the next row with the same sign.
+        where u acted before, as ``first_lag`` 0 says or y, which answers in the next row with the same sign.
     lag : int
         Rows by which u came first where the relation forward is closest.
     sign : {1, -1}
@@ -296,7 +296,8 @@ def dependence(u: FloatArray, y: FloatArray, *, first_lag: int = 1, fed_back: bo
     backward, *_ = _closest(_innovations(y, _COMMAND), _innovations(u, _ROUNDING), 1)
     size = float(np.linalg.norm(e_u) * np.linalg.norm(e_y))
     same = float(e_u @ e_y) / size * math.sqrt(e_u.size) if size > 0.0 and first else 0.0
-    if lag == first and sign == np.sign(same):  # a controller's gain has the sign that turns the plant's answer back
+    # a controller's gain has the sign that turns the plant's answer back, where there is an answer
+    if forward < CHANCE and lag == first and sign == np.sign(same):
         same = 0.0
     return Dependence(
         forward=forward, backward=backward, same_row=same, lag=lag * every, sign=sign, within=within * every
