@@ -19,11 +19,12 @@ import numpy as np
 from scipy.signal import lfilter
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.evidence.residual import NEW, FreedResidual, Place, filled, last_known
+from autotune.diagnosis.evidence.residual import NEW, FreedResidual, filled, last_known
 from autotune.diagnosis.evidence.swings import Swinging, explained_by_swings
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.windows import model_lag_s
+from autotune.models import Place
 from autotune.recording import Recording
 
 #: Fastest swing that is looked for, in cycles per slowest lag, and the most frequencies.

@@ -19,9 +19,10 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.evidence.residual import DIRECTION, FreedResidual, Place, ridge
+from autotune.diagnosis.evidence.residual import DIRECTION, FreedResidual, ridge
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
+from autotune.models import Place
 
 #: Most terms that a person can still read as one equation.
 MOST_TERMS = 3

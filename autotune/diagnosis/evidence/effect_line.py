@@ -247,7 +247,7 @@ class EffectLine(LawLine):
         plain, shown = sim.driven_at(max(way, 0)), []
         for q in range(columns[0].shape[1]):
             rows = []
-            for r, s, ok, windows in zip(data.recordings, columns, data.good, data.windows, strict=True):
+            for r, s, ok, windows in zip(data.recordings, columns, data.good, data.windows_here, strict=True):
                 driven = replace(r, u=np.ascontiguousarray(s[:, q]), extra={})
                 out = s[:, q] if way < 0 else plain.run(driven, np.zeros(sim.order), windows, signals=1)[0][:, 0]
                 rows.append(np.where(ok, out, 0.0))

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -17,8 +17,8 @@ from autotune.diagnosis.fitting.fit import Fit
 from autotune.diagnosis.fitting.noise import noise_from_differences
 from autotune.diagnosis.simulation.chain import Chain
 from autotune.diagnosis.simulation.simulator import Simulator
+from autotune.models import Place
 
-Place: TypeAlias = Literal["actuator", "plant", "sensor"]
 #: Least share of a function's power that the model's own numbers cannot imitate.
 NEW = 1e-3
 #: Ridge on unit columns while subsets are compared.
@@ -61,7 +61,8 @@ class FreedResidual:
     def shown(self, place: Place, missing: Sequence[FloatArray]) -> FloatArray:
         """Return how a missing signal, (N,) per recording, shows in the whitened residual, start states freed."""
         rows = []
-        for r, s, ok, windows in zip(self.data.recordings, missing, self.data.good, self.data.windows, strict=True):
+        here = self.data.windows_here
+        for r, s, ok, windows in zip(self.data.recordings, missing, self.data.good, here, strict=True):
             if place == "sensor":
                 out = s
             else:

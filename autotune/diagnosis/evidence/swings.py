@@ -12,8 +12,9 @@ from numba import njit
 from threadpoolctl import threadpool_limits
 
 from autotune.arrays import BoolArray, FloatArray
-from autotune.diagnosis.evidence.residual import NEW, FreedResidual, Place
+from autotune.diagnosis.evidence.residual import NEW, FreedResidual
 from autotune.diagnosis.simulation.many_inputs import first_command, responses
+from autotune.models import Place
 
 #: Numbers of one window's waves that are held in memory at once.
 AT_ONCE = 2_000_000

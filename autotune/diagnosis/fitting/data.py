@@ -169,13 +169,18 @@ class Data:
 
     @cached_property
     def windows(self) -> tuple[Windows, ...]:
-        """Every recording's windows, as a simulation takes them."""
+        """Every recording's windows, as a simulation takes them that is driven by all its rows."""
         if self.whole is None:
-            return tuple(Windows(starts=a, stops=b) for a, b in zip(self.starts, self.stops, strict=True))
+            return self.windows_here
         return tuple(
             Windows(starts=k[a], stops=k[b - 1] + 1, places=a, rows=k.size)
             for k, a, b in zip(self.kept, self.starts, self.stops, strict=True)
         )
+
+    @property
+    def windows_here(self) -> tuple[Windows, ...]:
+        """Every recording's windows, as a simulation takes them that is driven by signals of the rows that are here."""
+        return tuple(Windows(starts=a, stops=b) for a, b in zip(self.starts, self.stops, strict=True))
 
     @cached_property
     def edges(self) -> tuple[IntArray, IntArray]:

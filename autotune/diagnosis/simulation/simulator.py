@@ -267,7 +267,15 @@ def _tables(chain: Chain, falling: Chain, step_s: float) -> FloatArray:
 
 
 def _rows(windows: Windows | None, count: int) -> tuple[IntArray, int]:
-    """Return what the compiled simulation is told of windows, and how many rows it returns."""
+    """Return what the compiled simulation is told of windows, and how many rows it returns.
+
+    Raises
+    ------
+    ValueError
+        A window ends beyond the recording's rows: compiled code would read whatever memory lies there.
+    """
     if windows is None:
         return np.array([[0], [count], [0]], dtype=np.int64), count
+    if windows.stops.size and windows.stops.max() > count:
+        raise ValueError(f"a window ends at row {windows.stops.max()} of {count}")
     return windows.table, count if windows.rows is None else windows.rows

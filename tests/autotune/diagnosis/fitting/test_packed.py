@@ -8,6 +8,7 @@ from types import MappingProxyType
 import numpy as np
 import pytest
 
+from autotune.diagnosis.evidence.residual import FreedResidual
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import fit, states_of
 from autotune.diagnosis.fitting.noise import Noise
@@ -15,7 +16,8 @@ from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.fitting.retuning import reduced_chi2
 from autotune.diagnosis.fitting.spreading import spread_out
 from autotune.diagnosis.simulation.assembly import assemble
-from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
+from autotune.diagnosis.simulation.simulator import Windows
+from autotune.models import Block, Effect, Model, Parameter, Place, Port, TransferFunction
 from autotune.recording import Recording
 
 ROWS, WINDOW = 2000, 100
@@ -78,6 +80,29 @@ def test_a_fit_to_packed_rows_is_the_fit_to_those_rows_in_their_recordings(name:
     for one, other in zip(spread.signals + spread.whitened, large.signals + large.whitened, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(spread.jacobian[0], large.jacobian[0], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("place", ["actuator", "plant", "sensor"])
+def test_a_missing_signal_shows_in_packed_rows_as_in_those_rows_of_their_recordings(place: Place) -> None:
+    packed = some_windows(effect_of("environment.step_load"), 5)
+    assert packed.whole is not None
+    packed = replace(packed, noise=Noise(sd=0.01), whole=replace(packed.whole, noise=Noise(sd=0.01)))
+    whole = packed.spread_out()
+    p = parametrise(model(), [], 1.0, 0.1)
+    shown = []
+    for data in (packed, whole):
+        left = FreedResidual(fit(p, data), data)
+        shown.append(left.shown(place, [np.sin(0.3 * r.t) * r.u for r in data.recordings]))
+    rows = np.concatenate([np.arange(ROWS)[k] + number * ROWS for number, k in enumerate(packed.kept)])
+    np.testing.assert_allclose(shown[0], shown[1][rows], atol=1e-3 * float(np.max(np.abs(shown[1]))))
+    assert np.count_nonzero(shown[1]) <= packed.rows
+
+
+def test_a_window_beyond_a_recording_is_refused_before_it_is_read() -> None:
+    recording = Recording(t=np.arange(10.0), u=np.zeros(10), y=np.zeros(10))
+    beyond = Windows(starts=np.array([0]), stops=np.array([11]))
+    with pytest.raises(ValueError, match="row 11 of 10"):
+        assemble(model()).run(recording, np.zeros(1), beyond)
 
 
 def test_start_states_are_known_by_the_rows_of_the_whole_recordings() -> None:
