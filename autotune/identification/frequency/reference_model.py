@@ -69,6 +69,25 @@ def _residual(
     return out, K
 
 
+@njit(cache=True)
+def _jacobian(
+    theta: FloatArray,
+    error: FloatArray,
+    prior: FloatArray,
+    limit: FloatArray,
+    omega: FloatArray,
+    G: ComplexArray,
+    weight: FloatArray,
+) -> FloatArray:
+    """Return the derivatives of the errors at theta, by differences."""
+    out = np.empty((error.size, 3))
+    for j in range(3):
+        moved = theta.copy()
+        moved[j] += 1e-5
+        out[:, j] = (_residual(moved, prior, limit, omega, G, weight)[0] - error) / 1e-5
+    return out
+
+
 def _fit(
     start: FloatArray, limit: FloatArray, omega: FloatArray, G: ComplexArray, weight: FloatArray
 ) -> tuple[FloatArray, float, float]:
@@ -77,12 +96,8 @@ def _fit(
     error, K = _residual(theta, start, limit, omega, G, weight)
     cost = np.dot(error, error)
     damping = 1e-2
-    jacobian = np.empty((error.size, 3))
+    jacobian = _jacobian(theta, error, start, limit, omega, G, weight)
     for _ in range(60):
-        for j in range(3):
-            moved = theta.copy()
-            moved[j] += 1e-5
-            jacobian[:, j] = (_residual(moved, start, limit, omega, G, weight)[0] - error) / 1e-5
         normal = jacobian.T @ jacobian
         gradient = jacobian.T @ error
         for j in range(3):
@@ -97,6 +112,7 @@ def _fit(
             damping = max(damping * 0.2, 1e-9)
             if done:
                 break
+            jacobian = _jacobian(theta, error, start, limit, omega, G, weight)
         else:
             damping *= 5.0
             if damping > 1e9:
