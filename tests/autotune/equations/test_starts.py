@@ -2,35 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from autotune.arrays import FloatArray
 from autotune.equations import Compiled, Drive, compile_model, simulate
-from autotune.equations.files import read_any_model
-from autotune.equations.model import EquationModel
 from autotune.equations.sensitivity import Windows
 from autotune.equations.starts import fit_starts, rest_state
-from tests.autotune.equations.models import model
+from tests.autotune.equations.models import model, one_state
 
 ROWS = 1200
-TANK = """
-name = "tank"
-[[input]]
-column = "u"
-[output]
-value = "level"
-[[state]]
-name = "level"
-kind = "level"
-derivative = "k*u - a*sqrt(max(level, 0))"
-[parameters.k]
-value = {k}
-[parameters.a]
-value = {a}
-"""
 
 
 def _swinging(seed: int) -> tuple[Compiled, Drive, FloatArray, FloatArray]:
@@ -70,11 +51,9 @@ def test_starts_keep_to_the_swing_of_the_readings_where_wrong_numbers_lead_a_sim
 
 
 @pytest.mark.parametrize("unit", [1e-12, 1e-6, 1.0, 1e9])
-def test_a_rest_is_found_in_every_unit_of_its_state(unit: float, tmp_path: Path) -> None:
+def test_a_rest_is_found_in_every_unit_of_its_state(unit: float) -> None:
     """A tank rests at (k u / a)^2 = 4, in whatever its level is told."""
-    (tmp_path / "tank.toml").write_text(TANK.format(k=0.5 * unit, a=unit**0.5))
-    tank = read_any_model(tmp_path / "tank.toml")
-    assert isinstance(tank, EquationModel)
-    compiled = compile_model(tank)
+    numbers: dict[str, object] = {"k": {"value": 0.5 * unit}, "a": {"value": unit**0.5}}
+    compiled = compile_model(one_state("k*u - a*sqrt(max(x, 0))", numbers))
     rest = rest_state(compiled, compiled.parameter_vector, np.array([4.0]), float("nan"))
     assert rest / unit == pytest.approx(4.0, rel=1e-6)
