@@ -17,8 +17,6 @@ from autotune.effects.base import EffectKind, SignalSizes
 from autotune.errors import IdentificationError
 from autotune.models import Effect, Model
 
-#: Share of chi-square up to which a predicted decrease is rounding, which differs between processors.
-ROUNDING = 1e-9
 #: Most simulations of one effect while it is shrunk, and the share of chi2 that a simulation counts that ran away.
 SHRINKINGS, RAN_AWAY = 4, 1e6
 #: One turn in units of an angle.
@@ -190,8 +188,6 @@ def _predicted(base: Fit, effect: Effect, data: Data) -> tuple[Prediction, float
     scaled = _scaled(effect, a, 20.0 if kind.is_signed else 2.0)
     least = min(data.thresholds.beyond_chance, curvature) if kind.impacts else 0.0
     decrease = max(2.0 * a * slope - a * a * curvature, least)
-    if decrease <= ROUNDING * base.chi2:
-        return nothing, curvature / base.chi2
     return Prediction(effect=effect, decrease=decrease, scaled=scaled), curvature / base.chi2
 
 
