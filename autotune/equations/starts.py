@@ -68,8 +68,9 @@ def rest_state(compiled: Compiled, parameters: FloatArray, inputs: FloatArray, y
         return np.where(np.isfinite(found), np.clip(found, -1e12, 1e12), 1e12)
 
     tries = [base[free], base[free] + (y if np.isfinite(y) else 1.0), base[free] + 1.0]
-    # gtol is a slope of squares, in units of the states: a small unit would end the search where it begins
-    results = [least_squares(misses, z, x_scale=np.maximum(np.abs(z), 1.0), gtol=None, max_nfev=60) for z in tries]
+    # MINPACK's conditions know no units, and it may begin where nothing is missed; its slopes count as evaluations
+    calls = 60 * (free.size + 1)
+    results = [least_squares(misses, z, method="lm", x_scale=np.maximum(np.abs(z), 1.0), max_nfev=calls) for z in tries]
     least = 1e-12 * max(0.5 * float(np.sum(misses(z) ** 2)) for z in tries) + 1e-300
     best = min(results, key=lambda result: (round(float(np.log10(result.cost + least)), 1), float(result.x @ result.x)))
     return point(np.asarray(best.x, dtype=np.float64))
