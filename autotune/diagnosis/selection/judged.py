@@ -19,11 +19,13 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.stretches import STRETCHES
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.effects import shared_name
+from autotune.effects import KINDS, shared_name
 from autotune.models import Effect
 
 #: Added to squared errors, for a stretch without rows has none.
 TINY = 1e-300
+#: How far every effect stands from the reading: the catalogue has them in the order in which a signal meets them.
+_ORDER = {name: -k for k, name in enumerate(KINDS)}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -169,8 +171,17 @@ def worst(one: Judged, others: Sequence[Judged]) -> float:
 
 
 def rank(found: Sequence[_J]) -> list[_J]:
-    """Return hypotheses by how far the best rival of each is ahead of it: the first is beaten by none, or by least."""
-    return sorted(found, key=lambda j: worst(j, found))
+    """Return hypotheses by how far the best rival of each is ahead of it: the first is beaten by none, or by least.
+
+    Two lags in one line are the same by any recording, and rounding would choose between them: what no hundredth of
+    2 ln odds tells apart comes with fewer effects first, then with those that stand nearest to the reading.
+    """
+
+    def place(one: _J) -> tuple[float, int, list[int], float]:
+        behind = worst(one, found)
+        return round(behind, 2), len(one.names), sorted(_ORDER[name] for name in one.names), behind
+
+    return sorted(found, key=place)
 
 
 def leading(found: Sequence[_J], count: int) -> list[_J]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autotune.arrays import FloatArray
+from autotune.diagnosis.fitting.bases import basis
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.descent import bounded
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, residual_at
@@ -17,6 +18,8 @@ from autotune.effects.base import EffectKind, SignalSizes
 from autotune.errors import IdentificationError
 from autotune.models import Effect, Model
 
+#: Share of its size by which a start state is moved for its derivative.
+NUDGE = 1e-3
 #: Most simulations of one effect while it is shrunk, and the share of chi2 that a simulation counts that ran away.
 SHRINKINGS, RAN_AWAY = 4, 1e6
 #: One turn in units of an angle.
@@ -146,11 +149,27 @@ def direction(base: Fit, effect: Effect, data: Data) -> FloatArray:
     AutotuneError, OverflowError, LinAlgError
         The simulation runs away with the effect.
     """
+    return _directions(base, effect, data)[0]
+
+
+def _directions(base: Fit, effect: Effect, data: Data) -> tuple[FloatArray, FloatArray]:
+    """Return that direction (N,), and those of the start states that the effect adds (N, s), all windows at once."""
     p, theta, states = extend(base, effect, data)
-    moved = residual_at(p, data, theta, states) - base.e
-    if not bounded(moved):
+    with_it = residual_at(p, data, theta, states)
+    if not bounded(with_it - base.e):
         raise IdentificationError("the simulation runs away", where=effect.name)
-    return base.without_states(moved)
+    added = states[0].shape[1] - base.x0[0].shape[1]
+    part = kind_of(effect.name).linear
+    first = 0 if part is None or part.at == "front" else states[0].shape[1] - added
+    sizes = p.simulator(theta).state_sizes(
+        [r.u for r in data.driving], [r.y[g] for r, g in zip(data.recordings, data.good, strict=True)]
+    )
+    columns = np.empty((with_it.size, added))
+    for k in range(added):
+        nudged = tuple(x + NUDGE * sizes[first + k] * (np.arange(x.shape[1]) == first + k) for x in states)
+        column = residual_at(p, data, theta, nudged) - with_it
+        columns[:, k] = base.without_states(column) / NUDGE if bounded(column) else 0.0
+    return base.without_states(with_it - base.e), columns
 
 
 def distinct_starts(group: Sequence[Prediction]) -> list[Effect]:
@@ -170,15 +189,17 @@ def _predicted(base: Fit, effect: Effect, data: Data) -> tuple[Prediction, float
     The direction d = e(with effect) - e(without) is freed of what the numbers already free could explain; the decrease
     of |e + a d|^2 over 0 <= a <= 4 is predicted, over -20 <= a <= 20 for an effect of either sign. After an impact
     everything goes another way, which no first order tells: a stop that is touched predicts a little always.
+    The start states that an effect adds move with it: a lag under a command that is held acts through them alone.
     """
     kind = kind_of(effect.name)
     nothing = Prediction(effect=effect, decrease=0.0, scaled=effect)
     try:
-        d = direction(base, effect, data)
+        d, added = _directions(base, effect, data)
     except RUNAWAY:
         return nothing, RAN_AWAY
     # the fit is at rest: its numbers have nothing to gain by themselves, and their priors are weighed with chi2
-    slope, curvature = -float(d @ base.e), float(d @ base.without_numbers(d))
+    e, d = _without(base, added, base.e), _without(base, added, d)
+    slope, curvature = -float(d @ e), float(d @ base.without_numbers(d))
     if curvature == 0.0:
         return nothing, 0.0
     low, high = SIGNED if kind.is_signed else ONE_WAY
@@ -187,8 +208,21 @@ def _predicted(base: Fit, effect: Effect, data: Data) -> tuple[Prediction, float
     a = float(np.clip(slope / curvature, low, high))
     scaled = _scaled(effect, a, 20.0 if kind.is_signed else 2.0)
     least = min(data.thresholds.beyond_chance, curvature) if kind.impacts else 0.0
-    decrease = max(2.0 * a * slope - a * a * curvature, least)
+    # what each start state explains by chance does not count
+    by_states = base.chi2 - float(e @ e) - len(base.windows) * added.shape[1] * max(1.0, base.chi2 / base.rows)
+    decrease = max(2.0 * a * slope - a * a * curvature + max(by_states, 0.0), least)
     return Prediction(effect=effect, decrease=decrease, scaled=scaled), curvature / base.chi2
+
+
+def _without(base: Fit, added: FloatArray, direction: FloatArray) -> FloatArray:
+    """Return what is left of a direction when the start states that an effect adds may move against it as well."""
+    if added.shape[1] == 0:
+        return direction
+    left = direction.copy()
+    for a, b in base.windows:
+        Q = basis(added[a:b])
+        left[a:b] -= Q @ (Q.T @ left[a:b])
+    return left
 
 
 def _scaled(effect: Effect, a: float, most: float = np.inf, least: float = 0.05) -> Effect:
