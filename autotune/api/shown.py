@@ -330,3 +330,4 @@ for _shown in SHOWN:
     setattr(_shown, "_repr_html_", html)  # noqa: B010 - the rooms below know nothing of notebooks
 # printed as it is, it would be all matrices and residuals of every structure that was tried
 setattr(ClosedLoopIdentification, "__str__", text)  # noqa: B010 - see above
+setattr(ClosedLoopIdentification, "__repr__", text)  # noqa: B010 - see above

@@ -168,6 +168,7 @@ def test_every_result_shows_itself_plots_and_becomes_a_frame(oven):
         assert shown.startswith("<table>")
         assert "nan" not in shown
         assert len(at.to_pandas(result)) > 0
+        assert len(repr(result)) < 3000  # what a prompt prints of it is at most a screen
     for result in (oven, points, reduced, loop, loop.estimate.model, ball, move, at.PI(K=1.0, Ti_s=2.0), design):
         assert len(at.plot(result).data) >= 2
         figure, axes = plt.subplots(2, 1)
