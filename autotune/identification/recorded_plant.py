@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import count, product
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -34,6 +34,8 @@ _ORDERS = (1, 2, 3)
 _FIRST_ZERO = 0.1
 _ZEROS = (0.25, 0.5, 1.0, 2.0)
 _ZERO_STEPS = 12
+#: Rows of y among which structures are chosen: what so many exclude is excluded by all.
+_CHOSEN_ON = 20_000
 #: probability of what points of the same plant are off a fit, below which they contradict it; draws of the fit for it
 _CONTRADICTED, _DRAWS = 1e-4, 200
 
@@ -51,6 +53,7 @@ class _Fitted:
     structure: _Structure
     models: tuple[DelayModel, ...]
     tau_s: float = 0.0
+    thinned: bool = True  # whether long recordings were fitted to some of their rows
 
     @property
     def coefficients(self) -> int:
@@ -91,10 +94,27 @@ def fit_recordings(
 
     Notes
     -----
+    Of long records one row in so many chooses among the structures, and all rows are fitted with those that remain.
     Resonances are in the class, and in open loop one zero of a plant of order 2 (inverse response, overshoot); under
     feedback a zero would take up what the noise model leaves of the load that the controller answers. There the inverse
     of the controller, delayed, may fit best as well, as what the noise does comes back by it.
     """
+    fits = _agreeing(recordings, _every_structure(recordings, progress), unbiased)
+    if any(_one_in(one) > 1 for one in recordings):
+        progress("fitting all rows", 0.9)
+        least = min(fit.criterion for _, fit in fits)
+        kept = [one for one, fit in fits if fit.criterion - least < EXCLUDED]
+        fits = _agreeing(recordings, _on_all_rows(recordings, kept), unbiased)
+    return not_excluded([fit for _, fit in fits])
+
+
+def _one_in(recording: Recording) -> int:
+    """Return in how many rows one is fitted to choose: a prime, to meet rows at all distances from regular steps."""
+    return next(k for k in count(max(1, len(recording) // _CHOSEN_ON)) if all(k % d for d in range(2, k)))
+
+
+def _every_structure(recordings: Sequence[Recording], progress: Progress) -> list[_Fitted]:
+    """Return the structures that some of the rows determine, those with a zero besides."""
     found: list[_Fitted] = []
     reason: AutotuneError | None = None
     kinds = list(product(_ORDERS, (False, True)))
@@ -102,7 +122,7 @@ def fit_recordings(
         progress(f"fitting order {order}{', integrating' if integrator else ''}", i / (len(kinds) + 1))
         structure = _Structure(order=order, integrator=integrator)
         try:
-            models = tuple(identify_delay(one, order, integrator=integrator) for one in recordings)
+            models = tuple(identify_delay(one, order, integrator=integrator, every=_one_in(one)) for one in recordings)
         except AutotuneError as error:  # the order is more than the record determines
             reason = reason or error
             continue
@@ -116,16 +136,36 @@ def fit_recordings(
     progress("looking for a zero", len(kinds) / (len(kinds) + 1))
     if not any(is_fed_back(one) for one in recordings):
         found += [zero for one in found if one.structure.order == 2 and (zero := _zero(recordings, one)) is not None]
+    return found
+
+
+def _on_all_rows(recordings: Sequence[Recording], kept: Sequence[_Fitted]) -> list[_Fitted]:
+    """Return structures that were chosen on some of the rows, fitted to all of them from where they are."""
+    found: list[_Fitted] = []
+    for structure in {one.structure: None for one in kept}:
+        alike = [one for one in kept if one.structure == structure]
+        without = _at_zero(recordings, replace(alike[0], thinned=False), 0.0)
+        if without is not None:
+            found.append(without)
+            zero = _zero(recordings, without) if any(one.tau_s for one in alike) else None
+            found += [] if zero is None else [zero]
+    return found or list(kept)
+
+
+def _agreeing(
+    recordings: Sequence[Recording], found: Sequence[_Fitted], unbiased: Sequence[FrequencyPoint]
+) -> list[tuple[_Fitted, PlantFit]]:
+    """Return structures with their regions, but for those that points contradict; IdentificationError without any."""
     rows = [min(one.models[i].rows for one in found) for i in range(len(recordings))]
-    fits = [_with_zero(recordings, one, rows) if one.tau_s else _join(one, rows) for one in found]
-    agreeing = [fit for fit in fits if _agrees(fit, unbiased)]
+    fits = [(one, _with_zero(recordings, one, rows) if one.tau_s else _join(one, rows)) for one in found]
+    agreeing = [(one, fit) for one, fit in fits if _agrees(fit, unbiased)]
     if not agreeing:
         raise IdentificationError(
             "what y does after u is not what it does after the set-point, with any structure",
             where=recordings[0].name,
             remedy="move the set-point more, or record the plant with the controller off",
         )
-    return not_excluded(agreeing)
+    return agreeing
 
 
 def _agrees(fit: PlantFit, points: Sequence[FrequencyPoint]) -> bool:
@@ -152,7 +192,9 @@ def _at_zero(recordings: Sequence[Recording], near: _Fitted, tau_s: float) -> _F
     n, integrator = near.structure.order, near.structure.integrator
     try:
         models = tuple(
-            identify_delay(_leading(one, tau_s), n, integrator=integrator, start=model)
+            identify_delay(
+                _leading(one, tau_s), n, integrator=integrator, start=model, every=_one_in(one) if near.thinned else 1
+            )
             for one, model in zip(recordings, near.models, strict=True)
         )
     except AutotuneError:

@@ -53,6 +53,7 @@ def identify_delay(
     coloured: bool = True,
     skip_missing: bool = False,
     start: DelayModel | None = None,
+    every: int = 1,
     progress: Progress = quiet,
 ) -> DelayModel:
     """Estimate coefficients, gain, delay, operating point and initial state, with their covariance.
@@ -83,6 +84,8 @@ def identify_delay(
         Whether rows whose y is NaN, lost samples, are left out; refused otherwise.
     start : DelayModel, optional
         A model to begin with instead of the search, as when a window of a record follows another.
+    every : int
+        One row of y in so many is fitted, for a first look at a long record.
     progress : callable, optional
         Told what is being done and the share done.
 
@@ -116,7 +119,7 @@ def identify_delay(
     structure = Structure(order=order, integrator=integrator, offset=offset)
     data = prepare(
         recording, hold=hold, past_input=past_input, start_s=start_s, offset=offset, skip_missing=skip_missing
-    )
+    ).thinned(every)
     largest = _largest_delay(data, max_delay_s)
     if max_delay_s is None and (answered_s := latest_answer_s(recording)) is not None:
         largest = min(largest, answered_s)

@@ -182,13 +182,14 @@ def scan(data: DelayData, structure: Structure, best: Point, *, max_delay_s: flo
 
 def _section(data: DelayData, rows: int) -> DelayData:
     """Return the rows of y where u moves most, with the whole past of u."""
-    past = int(np.searchsorted(data.tu, data.ty[0]))
-    u = data.u[past : past + data.ty.size]
+    held = np.searchsorted(data.tu, data.ty, side="right") - 1  # rows of u, of which there may be more than of y
+    u = data.u[held]
     energy = np.concatenate([[0.0], np.cumsum((u - u.mean()) ** 2)])
     starts = np.arange(0, energy.size - rows, max(1, rows // 4))
     first = int(starts[np.argmax(energy[starts + rows] - energy[starts])]) if starts.size else 0
     ty, y = data.ty[first : first + rows], data.y[first : first + rows]
-    keep = slice(max(0, past + first - rows), past + first + rows)
+    begin, end = int(held[first]), int(held[first : first + rows][-1]) + 1
+    keep = slice(max(0, 2 * begin - end), end)
     before = data.before if keep.start == 0 else None
     return replace(data, tu=data.tu[keep], u=data.u[keep], ty=ty, y=y, before=before)
 

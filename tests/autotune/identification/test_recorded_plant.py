@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from autotune.arrays import FloatArray
@@ -18,6 +19,7 @@ from autotune.recording import Recording
 BUMPS = ((300.0, 5.0), (700.0, -5.0), (1100.0, -5.0), (1500.0, 5.0))
 NOISE = 0.05
 T = np.arange(1900.0)
+OMEGA = np.geomspace(0.01, 0.3, 8)
 #: a small lag beside a dead time: the record determines their sum
 PLANT = TransferFunction(num=(0.8,), den=tuple(np.polymul([90.0, 1.0], [6.0, 1.0])), delay_s=16.0)
 
@@ -63,6 +65,33 @@ def test_the_region_is_no_wider_than_the_record_where_a_controller_works(seed: i
     assert np.max(np.abs(turned)) < 2.5
     worst = max(deviance(plant) for plant in plants) - deviance(fit.plant)
     assert worst < 20.0 * chi2.ppf(0.95, 4)  # the region is of first order; beyond that only its shape is wrong
+
+
+def long_recording() -> Recording:
+    """Lags of 12 and 4 rows behind a dead time of 5, steps of u every 22 rows: 60,000 of them."""
+    rng, rows = np.random.default_rng(4), 60_000
+    u = np.repeat(rng.choice([-1.0, 1.0], rows // 22 + 1), 22)[:rows]
+    poles = np.exp([-1.0 / 12.0, -1.0 / 4.0])
+    slow, fast = (lfilter([0.0, 1.0 - pole], [1.0, -pole], u) for pole in poles)  # exact, as u is held
+    y = np.concatenate([np.zeros(5), (3.0 * slow - fast)[:-5]]) + 0.1 * rng.standard_normal(rows)
+    return Recording(t=np.arange(float(rows)), u=u, y=y, name="long")
+
+
+def test_of_a_long_record_all_rows_count() -> None:
+    """One row in three chooses the structure, and all are fitted with it."""
+    fit, model = fit_recordings([long_recording()]), identify_delay(long_recording(), 2)
+    truth = [-1.0 / 48.0, -(1.0 / 12.0 + 1.0 / 4.0), 2.0 / 48.0, 5.0]
+    assert fit.plant.poles.size == 2
+    assert np.all(np.abs((np.array([*model.a, model.b, model.delay_s]) - truth) / model.standard_deviations[:4]) < 4.0)
+    np.testing.assert_allclose(fit.plant.response(OMEGA), model.transfer_function().response(OMEGA), rtol=1e-4)
+    np.testing.assert_allclose(np.sqrt(fit.covariance[-1, -1]), model.standard_deviations[3], rtol=0.1)
+
+
+def test_one_row_in_eleven_finds_what_all_rows_determine() -> None:
+    """u moves between the rows of y that are left, and its response is exact at them all the same."""
+    few = identify_delay(long_recording(), 2, every=11)
+    assert few.rows <= 60_000 / 11 + 1
+    np.testing.assert_allclose([*few.a, few.b, few.delay_s], [-1 / 48, -1 / 3, 2 / 48, 5.0], rtol=0.1)
 
 
 @pytest.mark.parametrize(("slower", "smaller"), [(600.0, 1e-4), (1e-4, 1e4)])
