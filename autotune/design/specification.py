@@ -153,7 +153,7 @@ class Design:
     binding : tuple of str
         Constraints that hold with equality: ``modulus margin``, ``phase margin``, ``noise gain``, ``delay margin``.
     margins : Margins
-        Margins with the plant that was designed on.
+        The least over the plants that it was designed for; norm and crossover are those of the nominal one.
     certificate : str
         In a sentence, what the lower bound covers or why there is none.
     is_integral : bool

@@ -186,12 +186,16 @@ def _loop_section(analysis: Analysis, signals: SignalSettings) -> Section:
 
 
 def _margins_table(source: str, rows: Sequence[tuple[str, str, str]]) -> Table:
-    """Return gains and margins, once where the controller was designed on the fitted plant itself."""
-    if source == "fitted plant":
+    """Return gains and margins: of all that the controller was designed for, and of the fitted plant; once if alike."""
+    if source != "fitted plant":
+        caption = f"On the {source}, which the controller was designed on, and on the fitted plant"
+        return Table(caption=caption, header=("", source, "fitted plant"), rows=tuple(rows))
+    caption = "On the fitted plant, and the least over the region of it that the controller was designed for"
+    two = tuple((name, on_plant, least) for name, least, on_plant in rows)
+    if all(on_plant == least for _, on_plant, least in two):
         caption = "On the fitted plant, which the controller was designed on"
-        return Table(caption=caption, header=("", source), rows=tuple(row[:2] for row in rows))
-    caption = f"On the {source}, which the controller was designed on, and on the fitted plant"
-    return Table(caption=caption, header=("", source, "fitted plant"), rows=tuple(rows))
+        return Table(caption=caption, header=("", source), rows=tuple(row[:2] for row in two))
+    return Table(caption=caption, header=("", source, "least over its region"), rows=two)
 
 
 def _loop_figures(analysis: Analysis) -> tuple[Figure, ...]:

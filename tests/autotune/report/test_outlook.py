@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from autotune.config.procedure import DesignSettings, SignalSettings
 from autotune.controller import PIDController
+from autotune.design.margins import margins
 from autotune.design.noise import LoopFacts
 from autotune.identification.parametric import PlantFit
 from autotune.models import TransferFunction
@@ -208,6 +209,17 @@ def test_a_page_claims_no_slider_no_band_and_no_second_column_that_are_not_there
     assert known_well.source == "fitted plant"
     loop = next(one for one in analysis_sections(known_well, SIGNALS, None) if one.title == "Controller and margins")
     assert loop.tables[0].header == ("", "fitted plant")
+
+
+def test_margins_said_of_the_fitted_plant_are_its_own_and_not_those_of_its_region(analysis: Analysis) -> None:
+    assert analysis.source == "fitted plant"
+    loop = next(one for one in analysis_sections(analysis, SIGNALS, None) if one.title == "Controller and margins")
+    table, own = loop.tables[0], margins(analysis.fit.plant, analysis.controller)
+    rows = {str(row[0]): [float(str(cell)) for cell in row[1:]] for row in table.rows}
+    assert table.header == ("", "fitted plant", "least over its region")
+    assert rows["modulus margin"][0] == pytest.approx(own.modulus, rel=1e-3)
+    assert rows["phase margin [deg]"][0] == pytest.approx(math.degrees(own.phase_rad), rel=1e-3)
+    assert all(rows[name][1] < rows[name][0] for name in ("modulus margin", "phase margin [deg]"))
 
 
 def test_a_point_has_no_more_digits_than_its_interval_tells(analysis: Analysis) -> None:
