@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
-from autotune.arrays import ComplexArray, FloatArray, inverse_in_any_units, principal_axes
+from autotune.arrays import ComplexArray, FloatArray, principal_axes
 from autotune.distributions import chi2_quantile, chi2_tail
 from autotune.errors import IdentificationError
 from autotune.models import TransferFunction
@@ -26,8 +26,11 @@ from autotune.points import FrequencyPoint
 _MAX_LAGS = 2
 #: a structure whose Bayesian criterion is higher than the best one's by more is excluded by the data: odds of 20 to 1
 EXCLUDED = 2.0 * math.log(20.0)
-#: what a standard deviation may raise the sum of squares by where 1 is its rise to first order, and what shortens it
-_MOST_RISE, _SHORTER = 2.0, 0.7
+#: what a standard deviation may raise the sum of squares by where 1 is its rise to first order, and how often the
+#: factor that shortens it to that is halved
+_MOST_RISE, _HALVINGS = 2.0, 30
+#: share of the largest singular value below which another is rounding
+_TOLD = 1e-10
 #: directions besides the principal ones in which the border of a parameter region is visited
 _DIRECTIONS = 48
 
@@ -229,7 +232,8 @@ def _fit_structure(
             error = _whiten(_response(omega, found.x + step, sign, integrating) - measured, whitener)
             return float(error @ error) - chi_square
 
-    covariance = excess * _as_far_as_it_rises(inverse_in_any_units(found.jac.T @ found.jac), rise)
+    axes = _as_far_as_it_rises(found.jac, rise)
+    covariance = excess * axes @ axes.T
 
     def build(x: FloatArray) -> TransferFunction:
         return _plant(x, sign, integrating)
@@ -280,17 +284,34 @@ def _whiten(values: ComplexArray, whitener: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("nij,...nj->...ni", whitener, parts)).reshape(*values.shape[:-1], -1)
 
 
-def _as_far_as_it_rises(covariance: FloatArray, rise: Callable[[FloatArray], float]) -> FloatArray:
-    """Return the covariance, its principal axes no longer than the sum of squares says.
+def _as_far_as_it_rises(jacobian: FloatArray, rise: Callable[[FloatArray], float]) -> FloatArray:
+    """Return the principal axes of the covariance, (P, P), no longer than the sum of squares says.
 
     Two equal lags have one derivative: to first order nothing is known of their difference, and the sum of squares,
     which rises by 1 over a standard deviation, rises by far more. Where it does so to one side only, the axis stays.
+    What rounding makes of such an axis's length does not count, as it ends where the sum has risen by so much.
     """
-    axes = principal_axes(covariance)
+    sizes = np.linalg.norm(jacobian, axis=0)
+    felt = sizes > 0.0
+    _, values, vectors = np.linalg.svd(jacobian[:, felt] / sizes[felt], full_matrices=False)
+    axes = np.zeros((sizes.size, values.size))
+    axes[felt] = vectors.T / np.maximum(values, _TOLD * values[0]) / sizes[felt, None]
+
+    def rises_too_far(axis: FloatArray) -> bool:
+        return not min(rise(axis), rise(-axis)) <= _MOST_RISE
+
     for axis in axes.T:
-        while axis.any() and not min(rise(axis), rise(-axis)) <= _MOST_RISE:
-            axis *= _SHORTER
-    return np.asarray(axes @ axes.T, dtype=np.float64)
+        if not rises_too_far(axis):
+            continue
+        low = 0.0  # logarithm of what the axis is shortened by, between bounds of which one is short enough
+        while rises_too_far(axis * math.exp(low)):
+            low -= 2.0
+        high = low + 2.0
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if rises_too_far(axis * math.exp(middle)) else (middle, high)
+        axis *= math.exp(low)
+    return axes
 
 
 def _response(omega: FloatArray, parameters: FloatArray, sign: int, integrating: bool) -> ComplexArray:
