@@ -16,6 +16,8 @@ from __future__ import annotations
 
 import math
 import shutil
+import subprocess
+import sys
 import tempfile
 import weakref
 from collections.abc import Mapping
@@ -182,9 +184,11 @@ class FmuSimulation:
         self._variables, self._value, self._path = variables, value, path
         self._references = {v.name: v.valueReference for v in self._description.modelVariables}
         self._slave: Any = None
+        self._is_loadable = False
 
     def __call__(self, parameters: Mapping[str, float], drive: Drive) -> FloatArray:
         """Return y at the drive's rows."""
+        self._require_library()
         try:
             if self._description.coSimulation is not None:
                 return self._step_rows(parameters, drive)
@@ -193,6 +197,27 @@ class FmuSimulation:
             raise
         except Exception as error:  # an FMU fails with whatever its maker's code does
             raise InputError(f"the FMU fails: {error}", where=str(self._path), remedy="check its parameters") from None
+
+    def _require_library(self) -> None:
+        """Refuse an FMU whose compiled code the system does not load; FMPy's error would be taken for the model's."""
+        if self._is_loadable:
+            return
+        fmpy = _fmpy()
+        form = self._description.coSimulation or self._description.modelExchange
+        platform = fmpy.platform_tuple if str(self._description.fmiVersion).startswith("3.") else fmpy.platform
+        name = f"binaries/{platform}/{form.modelIdentifier}{fmpy.sharedLibraryExtension}"
+        library = Path(self._folder, name)
+        # code that was cut short can end the process that loads it
+        command = [sys.executable, "-I", "-S", "-c", "import ctypes, sys; ctypes.CDLL(sys.argv[1])", str(library)]
+        tried = subprocess.run(command, capture_output=True, text=True, check=False, errors="replace")
+        if tried.returncode:
+            said = (tried.stderr.strip().splitlines() or [""])[-1].removeprefix(f"OSError: {library}: ")
+            what = "it is missing" if not library.exists() else "it is damaged" if tried.returncode < 0 else said
+            raise InputError(
+                f"its compiled code {name} cannot be loaded ({what})", where=str(self._path),
+                remedy="copy or export the FMU again, or install the library that it needs",
+            )  # fmt: skip
+        self._is_loadable = True
 
     def _step_rows(self, parameters: Mapping[str, float], drive: Drive) -> FloatArray:
         """Run a co-simulation FMU: its own solver from row to row, inputs held."""

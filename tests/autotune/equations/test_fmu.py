@@ -138,6 +138,29 @@ def test_an_fmu_for_another_platform_is_one_line(folder: Path, tmp_path: Path) -
         read_any_model(tmp_path / "m.toml")
 
 
+@pytest.mark.parametrize(("kind", "fmi"), [(k, v) for k in ("CoSimulation", "ModelExchange") for v in (2, 3)])
+def test_compiled_code_that_cannot_be_loaded_is_said_to_be_so(tmp_path: Path, kind: str, fmi: int) -> None:
+    whole = build(tmp_path, kind, fmi=fmi).rename(tmp_path / "whole.fmu")
+    (tmp_path / "m.toml").write_text(MODEL)
+    r = recorded(1, rows=100)
+    drive = Drive(t=r.t, inputs=r.u[:, None])
+    for left, says in ((0, "file too short"), (1000, "it is damaged|file too short"), (None, "it is missing")):
+        with zipfile.ZipFile(whole) as old, zipfile.ZipFile(tmp_path / "rig.fmu", "w") as new:
+            for name in old.namelist():
+                content = old.read(name)
+                if not name.startswith("binaries"):
+                    new.writestr(name, content)
+                elif left is None:
+                    new.writestr(str(Path(name).with_name("another.so")), content)
+                else:
+                    new.writestr(name, content[:left])
+        box = read_any_model(tmp_path / "m.toml")
+        assert isinstance(box, BlackBox)
+        with pytest.raises(InputError, match=f"cannot be loaded .*({says})") as refused:
+            box.simulation({"J": 0.05, "c": 0.1}, drive)
+        assert refused.value.remedy == "copy or export the FMU again, or install the library that it needs"
+
+
 def test_a_step_function_is_retuned_like_any_model() -> None:
     def step(x, inputs, p, dt):  # type: ignore[no-untyped-def]
         lost = np.exp(-dt / p["T"])
