@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -138,10 +139,14 @@ def to_parquet(path: Path, out: Path, wanted: Sequence[str], export: ExportSetti
                     columns = [stamps, *(_with_decimal_point(batch.column(name), table.decimal) for name in kept)]
                     writer.write_table(pa.Table.from_arrays(columns, schema=pa.schema(fields)))
                     advance(path.name, file.tell() / size)
+        with part.open("rb+") as file:
+            os.fsync(file.fileno())
+        part.replace(out)
     except pa.ArrowInvalid as error:
         said = str(error).strip().splitlines()[0]
         raise InputError(said, where=str(path), remedy="correct the line, or leave the file out") from None
-    part.replace(out)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _head(path: Path, export: ExportSettings) -> tuple[Table, Callable[[Sequence[str]], tuple[Any, Any, Any]]]:

@@ -6,8 +6,8 @@ another one is drawn. Some cases change numbers only: a gain, an offset or a uni
 
 from __future__ import annotations
 
+import io
 import json
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -313,7 +313,7 @@ def write(folder: Path, rig: Rig, given: Sequence[Record], kept_back: Sequence[R
         What the tool is given, and what it is marked against.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    shutil.copy(rig.folder / "model.toml", folder / "model.toml")
+    write_text(folder / "model.toml", (rig.folder / "model.toml").read_bytes().decode())
     for i, r in enumerate(given, start=1):
         _write(folder / f"rec{i}.csv", r)
     if kept_back:
@@ -323,7 +323,9 @@ def write(folder: Path, rig: Rig, given: Sequence[Record], kept_back: Sequence[R
 def _write(path: Path, r: Record) -> None:
     columns = {"t": r.t, "u": r.u, "y": r.y, **r.others}
     rows = np.column_stack(list(columns.values()))
-    np.savetxt(path, rows, fmt="%.12g", delimiter=",", header=",".join(columns), comments="")
+    text = io.StringIO()
+    np.savetxt(text, rows, fmt="%.12g", delimiter=",", header=",".join(columns), comments="")
+    write_text(path, text.getvalue())
 
 
 def conceal(seed: int, rigs: Sequence[Ready], folder: Path, answer_file: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import fmpy
 import numpy as np
+import pyarrow.parquet
 import pytest
 import typer
 
@@ -26,9 +27,25 @@ from tests.autotune.test_pipeline import points_of
 from tests.autotune.test_pipeline_investigation import WITHOUT, tanks_model
 from tests.forked import call
 from tests.fuzz.moments import CONFIG, inputs
+from tests.sim.recorded_rig import write_rig
 
 CONTROLLER = 'kind = "pi"\nK = 0.5\nTi_s = 1.0\n'
 LAG = 'name = "lag"\n\n[[block]]\nname = "plant"\nplace = "plant"\nnum = [2.0]\nden = [1.0, 1.0]\n'
+EXPORT = """name = "plant"
+task = "identify"
+[export]
+time = "time"
+[[loop]]
+name = "A"
+file = "export.csv"
+u = "A.OP"
+y = "A.PV"
+[[loop]]
+name = "B"
+file = "export.csv"
+u = "A.OP"
+y = "B.PV"
+"""
 #: Journals: they grow by whole lines, at their own place.
 GROWING = {
     "run": ("progress.jsonl", "recording.csv", "verification.csv", "journal.jsonl", "audit.jsonl"),
@@ -89,7 +106,11 @@ COMMANDS: dict[str, tuple[list[str], tuple[str, ...]]] = {
         (),
     ),
     "prove": (["prove", "--cases", "1", "--seed", str(CLEAN), "--ties", "0", "--workers", "1", "--out", "o"], ()),
+    "prove --recordings": (
+        ["prove", "--recordings", "rigs", "--cases", "1", "--workers", "1", "--out", "o"], (),
+    ),
     "batch": (["batch", "campaign.toml", "--out", "o", "--workers", "1"], ()),
+    "batch of an export": (["batch", "export.toml", "--out", "o", "--workers", "1"], ()),
     "run": (["run", str(CONFIG), "--diagnose", "--out", "o"], ()),
 }  # fmt: skip
 
@@ -116,6 +137,11 @@ def kept(tmp_path: Path, command: list[str], results: tuple[str, ...]) -> list[P
     swing = np.sin(np.arange(400) / 4.0)
     np.savetxt(work / "swing.csv", np.column_stack([np.arange(400), swing, np.roll(swing, 3)]), header="t,u,y",
                delimiter=",", comments="")  # fmt: skip
+    write_rig(work / "rigs" / "servo", rows=600)
+    (work / "export.toml").write_text(EXPORT)
+    lines = (work / "r.csv").read_text().splitlines()[1:]
+    rows = [f"{1.7e9 + float(t):.1f},{u},{y},{y}" for t, u, y in (line.split(",") for line in lines)]
+    (work / "export.csv").write_text("\n".join(["time,A.OP,A.PV,B.PV", *rows]) + "\n")
     for result in results:
         (work / result).parent.mkdir(exist_ok=True)
         (work / result).write_bytes(OLD)
@@ -141,6 +167,8 @@ def assert_whole(file: Path) -> None:
             tomllib.loads(content.decode())
         case ".csv":
             assert content.endswith(b"\n")
+        case ".parquet":
+            pyarrow.parquet.read_table(file)
         case ".html":
             assert content.rstrip().endswith(b"</html>")
 
