@@ -27,6 +27,8 @@ from autotune.whole_files import append_whole, write_whole
 
 #: Largest size of a value that is computed with: far beyond every unit, far from where squares overflow.
 LARGEST = 1e15
+#: Time between two samples that no clock tells apart [s].
+CLOSEST_S = 1e-12
 
 #: An even grid may have so many rows, and ten times those of the recording.
 _MOST_NEW_ROWS = 100_000
@@ -104,6 +106,13 @@ class Recording:
                 f"time does not increase at data row {row + 1} (t = {self.t[row]:g} after {self.t[row - 1]:g})",
                 where=self.name,
                 remedy="sort the rows by t and drop repeated stamps",
+            )
+        if not float(np.min(steps)) >= CLOSEST_S:
+            row = int(np.argmin(steps)) + 1
+            raise InputError(
+                f"data rows {row} and {row + 1} are {steps[row - 1]:g} s apart, closer than any two samples are",
+                where=self.name,
+                remedy="write t in seconds",
             )
 
     def __len__(self) -> int:

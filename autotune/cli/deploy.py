@@ -96,6 +96,7 @@ def deploy(
         console.print(_comparison(content, old, to_be, form, (u_span, y_span), fit))
         if not yes and not typer.confirm("Write the new gains?"):
             raise InputError("refused: nothing was written", where="autotune deploy")
+        folder.mkdir(parents=True, exist_ok=True)  # not before: what is refused leaves no folder
 
     def try_out(held: PIDController, gains: TrialGains | None) -> Verification:
         assert measured is not None
@@ -143,6 +144,7 @@ def verify(
     own = isinstance(rig, HoldsGains) and controller is None
     gains = read_gains(rig) if isinstance(rig, HoldsGains) and own else _gains(controller, None, run)
     folder = _folder(config, run, out)
+    folder.mkdir(parents=True, exist_ok=True)
     verification = _verify(rig, content, gains, fit, measured, folder, on_device=own)
     result = next_free(folder / "verify.json", ".html")
     write_json({"controller": asdict(gains), "verification": verification_json(verification)}, result)
@@ -213,14 +215,9 @@ def _with_gains(rig: Rig) -> HoldsGains:
 
 def _folder(config: Path, run: Path | None, out: Path | None) -> Path:
     """Return the folder of the journal: the same for every call with the same arguments, so that it is found again."""
-    folder = out or run or config.with_name(f"{config.stem}-gains")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"cannot be made ({error.strerror})", where=str(folder), remedy="choose another --out"
-        ) from None
-    return folder
+    from autotune.outputs import OutputFolder
+
+    return OutputFolder(out or run or config.with_name(f"{config.stem}-gains"), ()).path
 
 
 def _restore_interrupted(rig: HoldsGains, journal: Path, console: Console, yes: bool, audit: AuditLog) -> None:

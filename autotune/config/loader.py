@@ -87,6 +87,18 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
+    def _has_noise_of_its_range(self) -> Config:
+        room = self.limits.y_max - self.limits.y_min
+        for key, plant in (("rig", self.rig), ("rig.twin", getattr(self.rig, "twin", None))):
+            noise = getattr(plant, "noise", None)
+            if noise is not None and noise > room:
+                raise ValueError(
+                    f"{key}.noise = {noise:g} is more than the {room:g} between limits.y_min and y_max: a sensor that"
+                    " shows nothing; give its half-width in the unit of y"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _has_time(self) -> Config:
         budget_s, sample_s = self.experiment.budget_s, self.signals.sample_time_s
         if budget_s < LEAST_SAMPLES * sample_s:

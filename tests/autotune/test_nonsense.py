@@ -44,6 +44,7 @@ def test_a_number_of_another_type_is_none(tmp_path: Path, value: str) -> None:
             {"[operating_point]": "[operating_point]\nplant_sign = true"},
             r"operating_point\.plant_sign = True: ",
         ),
+        ({"noise = 0.35": "noise = 1e308"}, r"rig\.noise = 1e\+308 is more than the 8 between limits\.y_min and y_max"),
         ({"K = -0.01": "K = 1e15"}, r"controller: K = 1e\+15 moves the command through its whole range, .* of 1e-14"),
         ({"K = -0.01": "K = -0.05", "Ti_s = 6.0": "Ti_s = 1e-6"}, r"controller: K / T_I = .* within one sample for"),
     ],
@@ -56,6 +57,22 @@ def test_what_a_rig_has_is_what_its_ranges_can_mean(tmp_path: Path, written: dic
     (tmp_path / "c.toml").write_text(text)
     with pytest.raises(InputError, match=said):
         load_config(tmp_path / "c.toml")
+
+
+@pytest.mark.parametrize("gains", ["K = 1e15\nTi_s = 1e-6\n", "K = 0.02\nTi_s = 3.6\n"])
+def test_gains_that_are_refused_leave_no_folder(tmp_path: Path, gains: str) -> None:
+    (tmp_path / "c.toml").write_text(f'kind = "pi"\n{gains}')
+    words = ["deploy", ROOT / "configs" / "ball_sim.toml", "--controller", "c.toml", "--no-verify", "--yes"]
+    done = autotune(*words, "--out", "new/o", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "nothing was written" in done.stderr
+    assert [file.name for file in tmp_path.iterdir()] == ["c.toml"]
+
+
+def test_samples_closer_than_any_clock_tells_apart_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "r.csv").write_text("t,u,y\n0,1,2\n1e-9,2,3\n1.0000001e-9,2,3\n")
+    with pytest.raises(InputError, match=r"r\.csv: data rows 2 and 3 are 1e-16 s apart, .*; write t in seconds"):
+        read_recording(tmp_path / "r.csv")
 
 
 def test_a_gap_of_years_takes_no_memory() -> None:
