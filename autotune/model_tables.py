@@ -169,6 +169,8 @@ def _block(table: Mapping[str, Any], where: str) -> Block:
         dynamics = TransferFunction(**coefficients, delay_s=_real(table.get("delay", 0.0), "delay", where))
     except InputError as error:
         raise InputError(error.what, where=where) from None
+    if not any(dynamics.num):
+        raise InputError("num is 0: nothing comes through this block", where=where, remedy="write its gain")
     if not dynamics.is_proper:
         raise InputError("num has a higher degree than den", where=where, remedy="a block must be proper")
     return Block(

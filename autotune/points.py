@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from autotune.arrays import FloatArray
+from autotune.arrays import FloatArray, is_real
 from autotune.errors import InputError
 from autotune.text_files import read_json
 
@@ -172,12 +172,19 @@ def require_regions(points: Sequence[FrequencyPoint], where: str) -> None:
         )
 
 
+def _number(value: Any) -> float:
+    """Return a number; a text or a truth value is none."""
+    if not is_real(value):
+        raise TypeError(value)
+    return float(value)
+
+
 def _point(entry: Any, where: str) -> FrequencyPoint:
     try:
-        omega, gain, phase_deg = (float(entry[key]) for key in ("omega_rad_s", "gain", "phase_deg"))
-        covariance = np.array(entry["cov"], dtype=np.float64)
+        omega, gain, phase_deg = (_number(entry[key]) for key in ("omega_rad_s", "gain", "phase_deg"))
+        covariance = np.array([[_number(one) for one in row] for row in entry["cov"]], dtype=np.float64)
     except (KeyError, TypeError, ValueError, OverflowError):
-        raise InputError("needs omega_rad_s, gain, phase_deg, cov [[,],[,]]", where=where) from None
+        raise InputError("needs omega_rad_s, gain, phase_deg, cov [[,],[,]] as numbers", where=where) from None
     for name, value in (("omega_rad_s", omega), ("gain", gain)):
         if not SMALLEST <= value <= LARGEST:
             raise InputError(f"{name} = {value:g}", where=where, remedy=f"it is from {SMALLEST:g} to {LARGEST:g}")

@@ -154,8 +154,10 @@ def init(
         twin = questions.ask("--plant", twin, asked, _plant_or_model, suggested="ball")
         questions.require()
     answers: Table = {}
+    told: Table = {"u_unit": u_unit, "y_unit": y_unit, "sample_time_s": sample_time, "u_range": u_range}
+    told |= {"u_safe": u_safe, "y_range": y_range, "y": y, "u": u}
     if simulated and isinstance(twin, str):
-        content = _simulated_config(twin)
+        content = _simulated_config(twin, told)
     else:
         given: Table = {"host": host, "device": device, "recording": recording, "y_span": y_span, "u_span": u_span}
         given |= {"endpoint": endpoint, "y_node": y_node, "u_node": u_node, "y_place": y_place, "u_place": u_place}
@@ -168,14 +170,7 @@ def init(
             twin = questions.ask("--model", twin, asked, _plant_or_model, "") or None
         if isinstance(twin, ModelOfRig):
             twin.place(config)  # refused before more is asked in vain
-        told: Table = {
-            "u_unit": u_unit,
-            "y_unit": y_unit,
-            "sample_time_s": sample_time,
-            "u_range": u_range,
-            "u_safe": u_safe,
-        }
-        answers = ask_signals(questions, told | {"y_range": y_range, "y": y, "u": u})
+        answers = ask_signals(questions, told)
         questions.require()
         played = _settings_of_twin(twin, config, answers)
         content = config_of(reached | (played if simulated else {"twin": played} if played else {}), answers)
@@ -219,6 +214,19 @@ def _settings_of_twin(twin: Plant | ModelOfRig | None, config: Path, answers: Ta
     return {} if twin is None else {"plant": twin, **PLANTS[twin].get("rig", {})}
 
 
-def _simulated_config(plant: Plant) -> Table:
-    known = dict(PLANTS[plant])
+def _simulated_config(plant: Plant, told: Table) -> Table:
+    """Return the configuration of a plant that is known, with what was told in place of what is known of it."""
+    known = {name: dict(table) for name, table in PLANTS[plant].items()}
+    for name in ("u_unit", "y_unit", "sample_time_s", "u_safe", "u_range", "y_range", "y", "u"):
+        match name, told[name]:
+            case _, None:
+                continue
+            case "u_range" | "y_range", (low, high):
+                known["limits"] |= {f"{name[0]}_min": low, f"{name[0]}_max": high}
+            case "u_safe", value:
+                known["limits"][name] = value
+            case "y" | "u", value:
+                known["operating_point"]["y" if name == "y" else "u_guess"] = value
+            case _, value:
+                known["signals"][name] = value
     return {"rig": {"kind": "simulated", "plant": plant, **known.pop("rig", {})}, **known}

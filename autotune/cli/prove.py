@@ -56,6 +56,10 @@ def prove(
     Without --recordings the recordings are simulated.
     """
     require_extra("batch", "distributed")
+    from autotune.effects import KINDS, unknown
+
+    if without not in ("", "all", *KINDS):
+        raise unknown(without, "--without")
     if scheduler is not None:
         out = out.absolute()  # its workers were started elsewhere
     if recordings is None:

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from autotune.arrays import FloatArray
+from autotune.errors import DesignError
+from autotune.models import LARGEST, SMALLEST
 
 
 class Figures(NamedTuple):
@@ -34,6 +36,26 @@ class Figures(NamedTuple):
     delay_s: float | FloatArray
     noise_gain: float | FloatArray
     controller_gain: float | FloatArray
+
+
+def require_frequency(name: str, value_rad_s: float) -> None:
+    """Refuse what is no frequency.
+
+    Parameters
+    ----------
+    name : str
+        What it is, for the message.
+    value_rad_s : float
+        What was given [rad/s].
+
+    Raises
+    ------
+    DesignError
+        Not positive, or beyond what is computed with.
+    """
+    if not SMALLEST <= value_rad_s <= LARGEST:
+        remedy = "it must be a positive frequency in rad/s"
+        raise DesignError(f"{name} = {value_rad_s:g}", where="specification", remedy=remedy)
 
 
 #: what :meth:`Specification.slacks` answers, in this order

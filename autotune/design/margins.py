@@ -11,7 +11,7 @@ import numpy as np
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.controller import Controller
-from autotune.design.figures import Figures
+from autotune.design.figures import Figures, require_frequency
 from autotune.design.loop import ContinuousLoop, OpenLoop, Plant, open_loop
 from autotune.design.norms import disturbance_h2
 
@@ -107,6 +107,11 @@ def margins(plant: Plant, controller: Controller, *, noise_frequency_rad_s: floa
     Margins
         Frozen.
 
+    Raises
+    ------
+    DesignError
+        A frequency of the noise that is none.
+
     Notes
     -----
     Extremes are found on a grid that resolves poles, zeros, resonances and dead time, and refined between its nodes;
@@ -118,6 +123,8 @@ def margins(plant: Plant, controller: Controller, *, noise_frequency_rad_s: floa
     ----------
     Le & Mendes 2010, equations (11) to (16).
     """
+    if noise_frequency_rad_s is not None:
+        require_frequency("noise frequency", noise_frequency_rad_s)
     loop = open_loop(plant, controller)
     omega = loop.grid
     L = loop.response(omega)

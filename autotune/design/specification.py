@@ -10,7 +10,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
-from autotune.design.figures import CONSTRAINTS, Figures
+from autotune.design.figures import CONSTRAINTS, Figures, require_frequency
 from autotune.design.margins import Margins
 from autotune.errors import DesignError
 from autotune.models import LARGEST, SMALLEST
@@ -82,8 +82,8 @@ class Specification:
         if not self.setpoint_command > 0.0:
             refuse("set-point command", self.setpoint_command, "positive")
 
-        if self.noise_frequency_rad_s is not None and not SMALLEST <= self.noise_frequency_rad_s <= LARGEST:
-            refuse("noise frequency", self.noise_frequency_rad_s, "a positive frequency in rad/s")
+        if self.noise_frequency_rad_s is not None:
+            require_frequency("noise frequency", self.noise_frequency_rad_s)
 
     @property
     def largest_gain(self) -> float:

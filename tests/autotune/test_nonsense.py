@@ -216,6 +216,7 @@ def test_nothing_is_appended_to_a_file_that_is_no_audit_log(tmp_path: Path) -> N
 OPTIONS = {
     "--modulus-margin": ["watch", "r.csv", "--modulus-margin", "-1", "--out", "o.csv"],
     "--phase-margin": ["watch", "r.csv", "--phase-margin", "-5", "--out", "o.csv"],
+    "unknown effect 'plant.leek'; did you mean 'plant.leak'": ["prove", "--without", "plant.leek", "--out", "o"],
     "--follow": ["watch", "r.csv", "--follow", "nan", "--out", "o.csv"],
     "--noise-frequency": ["tune", "r.csv", "--noise-frequency", "inf", "--out", "o"],
     "noise_gain": ["tune", "r.csv", "--noise-gain", "-1", "--out", "o"],
@@ -233,6 +234,44 @@ def test_an_option_beyond_its_range_is_one_line_that_names_it(tmp_path: Path, na
 
 
 LAG = '[[block]]\nname = "p"\nplace = "plant"\nnum = [2.0]\nden = [1.0, {last}]\n'
+
+
+@pytest.mark.parametrize(
+    ("num", "options", "said"),
+    [
+        ("[2.0]", ["--noise-frequency", "-1"], "noise frequency = -1; it must be a positive frequency in rad/s"),
+        ("[0.0]", [], "m.toml [[block]] 1: num is 0: nothing comes through this block; write its gain"),
+    ],
+)
+def test_margins_of_nothing_are_refused(tmp_path: Path, num: str, options: list[str], said: str) -> None:
+    (tmp_path / "m.toml").write_text('name = "lag"\n' + LAG.format(last=1.0).replace("[2.0]", num))
+    (tmp_path / "c.toml").write_text('kind = "pi"\nK = 0.5\nTi_s = 1.0\n')
+    done = autotune("margins", "--model", "m.toml", "--controller", "c.toml", *options, "--out", "o", cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["c.toml", "m.toml"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--sample-time", "-1"], "signals.sample_time_s = -1"),
+        (["--u-range", "10", "0"], "u_min"),
+        (["--u-safe", "99"], "u_safe"),
+        (["--y", "99"], "operating_point.y = 99"),
+        (["--u", "99"], "operating_point.u_guess = 99"),
+        (["--y-range", "5", "5"], "y_min"),
+    ],
+)
+def test_what_is_said_of_a_simulated_plant_counts(tmp_path: Path, flags: list[str], said: str) -> None:
+    """The flags were passed over, and a configuration written without them."""
+    done = autotune("init", "rig.toml", "--kind", "simulated", "--plant", "ball", *flags, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
 REFERENCES = {
     "u_rate = 0": ["--u-rate", "0"],
     "y_speed = -1": ["--y-speed", "-1"],
@@ -295,6 +334,17 @@ def test_points_on_which_no_design_can_rest_are_refused(tmp_path: Path, command:
     given = at.frequency_points(tmp_path / "p.json")
     with pytest.raises(InputError, match=said):
         (at.reduce if command == "reduce" else at.tune)(given)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("gain", True), ("gain", "2"), ("phase_deg", "-90"), ("cov", [["1", 0], [0, 1]])]
+)
+def test_points_of_texts_and_truths_are_refused(tmp_path: Path, key: str, value: object) -> None:
+    points = json.loads(points_of([0.5, 1.0, 2.0, 4.0], 0.01))
+    points["points"][1][key] = value
+    (tmp_path / "p.json").write_text(json.dumps(points))
+    with pytest.raises(InputError, match=r"p\.json points\[1\]: needs .* as numbers"):
+        at.frequency_points(tmp_path / "p.json")
 
 
 def test_windows_that_lie_in_a_gap_are_told_and_do_not_end_the_watch() -> None:
