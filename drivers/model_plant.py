@@ -15,11 +15,12 @@ from autotune.equations.chain import from_chain
 from autotune.equations.files import read_any_model
 from autotune.equations.linearise import linearise, transfer_function
 from autotune.equations.model import EquationModel
+from autotune.equations.rest import typical_sizes
 from autotune.equations.simulate import Drive, compile_model, derivatives, require_complete, simulate
 from autotune.errors import InputError
 from autotune.models import Model
 
-#: slope, relative to the states, below which a plant is at rest
+#: slope, in sizes of the states in the time of the fastest, below which a plant is at rest
 _AT_REST = 1e-9
 
 
@@ -165,11 +166,14 @@ class ModelPlant:
         """Return the states at rest under a command, None where there is no such rest."""
         if not given.size:
             return given
+        inputs = np.array([u, *self._others])
         with np.errstate(all="ignore"):
-            found = np.asarray(root(self._slopes, given, args=(u,)).x, dtype=np.float64)
-            largest = float(np.max(np.abs(found)))
-            slope = float(np.max(np.abs(self._slopes(found, u))))
-        return found if math.isfinite(largest) and slope <= _AT_REST * max(1.0, largest) else None
+            sizes, time_s = typical_sizes(self._compiled, self._parameters, inputs, given)
+            sizes = np.where(sizes > 0.0, sizes, 1.0)
 
-    def _slopes(self, states: FloatArray, u: float) -> FloatArray:
-        return self._look(states, u)[0]
+            def slopes(z: FloatArray) -> FloatArray:
+                return self._look(given + sizes * z, u)[0] * (time_s / sizes)
+
+            z = np.asarray(root(slopes, np.zeros(given.size)).x, dtype=np.float64)
+            largest, slope = float(np.max(np.abs(z))), float(np.max(np.abs(slopes(z))))
+        return given + sizes * z if math.isfinite(largest) and slope <= _AT_REST * max(1.0, largest) else None

@@ -18,6 +18,7 @@ import numpy as np
 from autotune.arrays import BoolArray, FloatArray, IntArray, deviations_beside_prior
 from autotune.equations.fit_data import FitData, Fitted, covered_rows, mean_squares
 from autotune.equations.parameter_scales import linear, slopes_of, values_of
+from autotune.equations.rest import state_scales, stated_starts
 from autotune.equations.sensitivity import (
     STEP,
     WORTH_A_THREAD,
@@ -28,7 +29,7 @@ from autotune.equations.sensitivity import (
     side_by_side,
 )
 from autotune.equations.simulate import Compiled, Drive, Run
-from autotune.equations.starts import restart_some, state_scales, stated_starts
+from autotune.equations.starts import restart_some
 from autotune.errors import InputError
 
 #: Relative decrease of the penalised sum of squares below which a fit has converged.

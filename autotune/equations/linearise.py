@@ -10,14 +10,15 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.equations.effects import apply
 from autotune.equations.model import EquationModel
+from autotune.equations.rest import input_sizes, rest_state, typical_sizes
 from autotune.equations.simulate import Compiled, compile_model, derivatives
-from autotune.equations.starts import rest_state
 from autotune.errors import InputError
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.recording import Recording
 
-#: Relative step of the central differences.
-_STEP = 1e-5
+#: Step of the central differences, in sizes of what is changed; and slope below which a state rests, in sizes in the
+#: time of the fastest.
+_STEP, _AT_REST = 1e-5, 1e-4
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -46,7 +47,9 @@ class Linear:
     delays_s: FloatArray
 
 
-def linearise(model: EquationModel, inputs: FloatArray, y: float = float("nan")) -> Linear:
+def linearise(
+    model: EquationModel, inputs: FloatArray, y: float = float("nan"), spread: FloatArray | None = None
+) -> Linear:
     """Linearise a model with its effects at rest under inputs.
 
     Parameters
@@ -57,6 +60,8 @@ def linearise(model: EquationModel, inputs: FloatArray, y: float = float("nan"))
         Inputs of the operating point.
     y : float
         The reading there, where several rests are possible (an integrating plant).
+    spread : (m,) array, optional
+        How far the inputs go from there, where that is known: what is small against it counts as rounding.
 
     Returns
     -------
@@ -72,13 +77,13 @@ def linearise(model: EquationModel, inputs: FloatArray, y: float = float("nan"))
     compiled = compile_model(model, applied.extensions)
     p = compiled.parameter_vector
     x = rest_state(compiled, p, inputs, y)
-    slopes, outputs = derivatives(compiled, p, x[None, :], inputs[None, :])
-    probe = np.abs(_differences(compiled, p, x, inputs)[0]) @ (np.abs(x) + 1e-3)
-    if not np.all(np.isfinite(slopes)) or np.any(np.abs(slopes[0]) > 1e-4 * (probe + 1.0)):
+    slopes = derivatives(compiled, p, x[None, :], inputs[None, :])[0][0]
+    kick = input_sizes(compiled, inputs if spread is None else np.maximum(np.abs(inputs), spread))
+    sizes, time_s = typical_sizes(compiled, p, inputs, x, kick)
+    if not np.all(np.isfinite(slopes)) or np.any(np.abs(slopes) * time_s > _AT_REST * sizes):
         raise InputError("no rest is found under these inputs", where=model.name,
                          remedy="give inputs, and y where the plant integrates, at which it can rest")  # fmt: skip
-    A, B, C, D = _differences(compiled, p, x, inputs)
-    return Linear(A=A, B=B, C=C, D=D, states=x, inputs=inputs, y=float(outputs[0, 0]), delays_s=applied.delays)
+    return _tangent(compiled, x, inputs, kick, applied.delays)
 
 
 def growth_rate(model: EquationModel, recordings: Sequence[Recording]) -> float:
@@ -121,44 +126,63 @@ def linearise_at(model: EquationModel, states: FloatArray, inputs: FloatArray) -
     """
     applied = apply(model)
     compiled = compile_model(model, applied.extensions)
-    p = compiled.parameter_vector
-    A, B, C, D = _differences(compiled, p, states, inputs)
-    y = float(derivatives(compiled, p, states[None, :], inputs[None, :])[1][0, 0])
-    return Linear(A=A, B=B, C=C, D=D, states=states, inputs=inputs, y=y, delays_s=applied.delays)
+    return _tangent(compiled, states, inputs, input_sizes(compiled, inputs), applied.delays)
 
 
 def _at_recordings(model: EquationModel, recordings: Sequence[Recording]) -> Linear | None:
     """Return a model linearised at the medians of recordings; nothing where nothing rests there."""
-    inputs = np.array([float(np.median(np.concatenate([r[name] for r in recordings]))) for name in model.columns])
+    columns = [np.concatenate([r[name] for r in recordings]) for name in model.columns]
+    inputs = np.array([float(np.median(one)) for one in columns])
+    spread = np.array([float(np.ptp(one)) for one in columns])
     y = float(np.nanmedian(np.concatenate([r.y for r in recordings])))
     for near in (float("nan"), y):
         try:
-            return linearise(model, inputs, near)
+            return linearise(model, inputs, near, spread)
         except InputError:
             continue
     return None
 
 
-def _differences(
-    compiled: Compiled, p: FloatArray, x: FloatArray, inputs: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    n, m = x.size, inputs.size
+def _tangent(compiled: Compiled, x: FloatArray, inputs: FloatArray, kick: FloatArray, delays_s: FloatArray) -> Linear:
+    """Return the tangent at a point by central differences; ``kick`` is how large the inputs are."""
+    n, p = x.size, compiled.parameter_vector
+    sizes = typical_sizes(compiled, p, inputs, x, kick)[0]
+    steps = _STEP * np.concatenate([np.where(sizes > 0.0, sizes, 1.0), kick])
     point = np.concatenate([x, inputs])
-    steps = _STEP * np.maximum(np.abs(point), 1.0)
-    points = np.concatenate([point + np.diag(steps), point - np.diag(steps)])
+    points = np.concatenate([point[None, :], point + np.diag(steps), point - np.diag(steps)])
     slopes, outputs = derivatives(compiled, p, points[:, :n], points[:, n:])
-    J = ((slopes[: n + m] - slopes[n + m :]) / (2.0 * steps[:, None])).T
-    g = ((outputs[: n + m, :1] - outputs[n + m :, :1]) / (2.0 * steps[:, None])).T
-    return J[:, :n], J[:, n:], g[:, :n], g[:, n:]
+    up, down = slice(1, 1 + steps.size), slice(1 + steps.size, None)
+    J = ((slopes[up] - slopes[down]) / (2.0 * steps[:, None])).T
+    g = ((outputs[up, :1] - outputs[down, :1]) / (2.0 * steps[:, None])).T
+    return Linear(
+        A=J[:, :n], B=J[:, n:], C=g[:, :n], D=g[:, n:], states=x, inputs=inputs, y=float(outputs[0, 0]),
+        delays_s=delays_s,
+    )  # fmt: skip
 
 
 def transfer_function(linear: Linear) -> TransferFunction:
     """Return the transfer function from the command to y, with its dead time."""
     from scipy.signal import ss2tf
 
-    num, den = ss2tf(linear.A, linear.B[:, :1], linear.C, linear.D[:, :1])
-    kept = np.where(np.abs(num[0]) > 1e-9 * np.max(np.abs(num[0])), num[0], 0.0)
+    A, B, C = linear.A, linear.B[:, :1], linear.C
+    # ss2tf subtracts two polynomials: what is told in small units would be lost in the digits of the other
+    scales = _balance(np.block([[A, B], [C, np.zeros((1, 1))]]))
+    x, port = scales[:-1], scales[-1]
+    A, B, C = A * x / x[:, None], B * port / x[:, None], C * x / port
+    gain = float(np.max(np.abs(C), initial=0.0) * np.max(np.abs(B), initial=0.0))
+    gain = gain / (float(np.max(np.abs(A), initial=0.0)) or 1.0) or 1.0
+    num, den = ss2tf(A, B, C / gain, linear.D[:, :1] / gain)
+    kept = gain * np.where(np.abs(num[0]) > 1e-9 * np.max(np.abs(num[0])), num[0], 0.0)
     return TransferFunction(num=tuple(kept), den=tuple(den), delay_s=float(linear.delays_s[0]))
+
+
+def _balance(M: FloatArray) -> FloatArray:
+    """Return the scales (n,) in which each row of a matrix (n, n) is as large as its column, the diagonal left out."""
+    scales, sizes = np.ones(len(M)), np.abs(M - np.diag(np.diag(M)))
+    for i in np.tile(np.arange(len(M)), 10):
+        row, column = np.sum(sizes[i] * scales) / scales[i], np.sum(sizes[:, i] / scales) * scales[i]
+        scales[i] *= np.sqrt(row / column) if row > 0.0 and column > 0.0 else 1.0
+    return scales
 
 
 def as_chain(model: EquationModel, linear: Linear) -> Model:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.equations.rest import rest_state, state_scales, stated_starts
 from autotune.equations.sensitivity import STEP, Windows, run_windows, sensitivities
-from autotune.equations.simulate import Compiled, Drive, Run, derivatives, simulate
+from autotune.equations.simulate import Compiled, Drive, Run
 
 #: Rows that a start state is fitted to at least; where those run away, to a part of them first, this many at least.
 LEAST, LEAST_WINDOW = 30, 4
@@ -19,93 +19,6 @@ HOPS, STRAYS = 8, 2.0
 #: Shares of its rows that a window started anew is fitted to, one after the other: wrong numbers lead the rest astray;
 #: and steps of each.
 ANEW, ANEW_STEPS = (0.1, 0.3, 1.0), 4
-
-
-def stated_starts(compiled: Compiled) -> FloatArray:
-    """Return the start value that the file states for each state, NaN where it is to be estimated, shape (n,)."""
-    known = {one.name: one.start for one in compiled.model.states}
-    values = [known.get(name) for name in compiled.states]
-    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
-
-
-def rest_state(compiled: Compiled, parameters: FloatArray, inputs: FloatArray, y: float) -> FloatArray:
-    """Return the state nearest to rest that reads y under inputs.
-
-    Parameters
-    ----------
-    compiled, parameters
-        The model.
-    inputs : (m,) array
-        What drives it.
-    y : float
-        The reading; NaN leaves it out.
-
-    Returns
-    -------
-    (n,) array
-        States that the file gives a start are left there.
-
-    Notes
-    -----
-    Least squares from a few starts; of several rests (a pendulum hangs or stands) the one nearest to zero is found.
-    """
-    given = stated_starts(compiled)
-    free = np.flatnonzero(~np.isfinite(given))
-    base = np.where(np.isfinite(given), given, 0.0)
-    if free.size == 0:
-        return base
-
-    def point(z: FloatArray) -> FloatArray:
-        x = base.copy()
-        x[free] = z
-        return x
-
-    def misses(z: FloatArray) -> FloatArray:
-        x = point(z)
-        slopes, outputs = derivatives(compiled, parameters, x[None, :], inputs[None, :])
-        off = outputs[0, 0] - y if np.isfinite(y) else 0.0
-        found = np.append(slopes[0], 1e3 * off)
-        return np.where(np.isfinite(found), np.clip(found, -1e12, 1e12), 1e12)
-
-    tries = [base[free], base[free] + (y if np.isfinite(y) else 1.0), base[free] + 1.0]
-    # MINPACK's conditions know no units, and it may begin where nothing is missed; its slopes count as evaluations
-    calls = 60 * (free.size + 1)
-    results = [least_squares(misses, z, method="lm", x_scale=np.maximum(np.abs(z), 1.0), max_nfev=calls) for z in tries]
-    least = 1e-12 * max(0.5 * float(np.sum(misses(z) ** 2)) for z in tries) + 1e-300
-    best = min(results, key=lambda result: (round(float(np.log10(result.cost + least)), 1), float(result.x @ result.x)))
-    return point(np.asarray(best.x, dtype=np.float64))
-
-
-def state_scales(compiled: Compiled, parameters: FloatArray, drive: Drive, start: FloatArray) -> FloatArray:
-    """Return how large each state typically is: what a change of it is measured by.
-
-    Parameters
-    ----------
-    compiled : Compiled
-        n states.
-    parameters : (P,) array
-        In their own units.
-    drive : Drive
-        The recording's inputs.
-    start : (n,) array
-        State at the first row.
-
-    Returns
-    -------
-    (n,) array
-        Sizes, in the states' units.
-    """
-    probe = np.linspace(0, drive.t.size - 1, min(drive.t.size, 400)).astype(np.int64)[:-1]
-    states = np.repeat(start[None, :], probe.size, axis=0)
-    run = simulate(compiled, parameters, drive, states, starts=probe, stops=probe + 1)
-    ends = run.ends[np.all(np.isfinite(run.ends), axis=1)]
-    whole = simulate(compiled, parameters, drive, start[None, :])
-    sizes = [np.abs(start), np.abs(whole.ends[0]) if whole.is_complete else np.zeros(start.size)]
-    if ends.size:
-        slopes = np.max(np.abs(ends - start), axis=0) / float(np.median(np.diff(drive.t)))
-        sizes.append(np.minimum(slopes, 1e6))
-    size = np.nanmax(np.array(sizes), axis=0)
-    return np.where(size > 1e-9, size, 1.0)
 
 
 def fit_starts(

@@ -12,8 +12,8 @@ from autotune.diagnosis.equations.judged import JudgedEquations
 from autotune.diagnosis.result import Diagnosis, NextExperiment, told_apart
 from autotune.equations.effects import apply
 from autotune.equations.model import EquationModel
+from autotune.equations.rest import rest_state
 from autotune.equations.simulate import Drive, simulate
-from autotune.equations.starts import rest_state
 from autotune.experiment.excitation import KINDS, Excitation
 from autotune.experiment_design.plan import ROOM_SHARE
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.equations.fit_data import Fitted
+from autotune.equations.rest import state_scales
 from autotune.equations.sensitivity import STEP, sensitivities
 from autotune.equations.simulate import Drive
-from autotune.equations.starts import state_scales
 
 
 def explained(fitted: Fitted) -> FloatArray:

@@ -14,7 +14,7 @@ from autotune.equations import Drive, EquationModel, combinations, compile_model
 from autotune.equations.fit import fit
 from autotune.equations.forecast import forecast
 from autotune.equations.parameter_scales import slopes_of, values_of
-from autotune.equations.starts import rest_state
+from autotune.equations.rest import rest_state
 from autotune.errors import InputError
 from autotune.recording import Recording
 from tests.autotune.equations.models import model, one_state

@@ -7,8 +7,9 @@ import pytest
 
 from autotune.arrays import FloatArray
 from autotune.equations import Compiled, Drive, compile_model, simulate
+from autotune.equations.rest import rest_state
 from autotune.equations.sensitivity import Windows
-from autotune.equations.starts import fit_starts, rest_state
+from autotune.equations.starts import fit_starts
 from tests.autotune.equations.models import model, one_state
 
 ROWS = 1200
