@@ -92,8 +92,7 @@ def late_rows(retuned: Fit, data: Data) -> SampleEffect | None:
     if not sim.is_linear or variance <= 0.0 or sim.linear_hold:
         return None
     recordings = [_rows(retuned, data, i) for i in range(len(data.recordings))]
-    commands = [r.u for r in data.driving]
-    spread = sim.state_sizes(commands, [r.y[g] for r, g in zip(data.recordings, data.good, strict=True)])
+    spread = sim.state_sizes(*data.spans)
     dt = data.sample_times[0]
 
     def told(correlation: float, jitter: float, load: float = 0.0) -> _Told:

@@ -11,6 +11,7 @@ from numba import njit
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.fitting.noise import Noise
+from autotune.diagnosis.simulation.assembly import spans_of
 from autotune.diagnosis.simulation.simulator import Windows
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.recording import Recording
@@ -162,7 +163,7 @@ class Data:
             return self.starts
         return tuple(k[a] for k, a in zip(self.kept, self.starts, strict=True))
 
-    @property
+    @cached_property
     def rows(self) -> int:
         """Rows that count."""
         return int(sum(g.sum() for g in self.good))
@@ -193,6 +194,12 @@ class Data:
     def command_spread(self) -> float:
         """Standard deviation of all commands, 1 where none moves."""
         return float(np.std(np.concatenate([r.u for r in self.driving]))) or 1.0
+
+    @cached_property
+    def spans(self) -> tuple[float, float]:
+        """Largest standard deviation of a command and of a recording's readings."""
+        readings = [r.y[g] for r, g in zip(self.recordings, self.good, strict=True)]
+        return spans_of([r.u for r in self.driving], readings)
 
     @cached_property
     def sample_times(self) -> tuple[float, ...]:

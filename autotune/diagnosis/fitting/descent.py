@@ -71,6 +71,8 @@ class Problem:
         self.first, self.last = data.edges
         #: How many windows every recording has
         self.counts = [len(a) for a in data.starts]
+        ends = np.cumsum(self.counts).tolist()
+        self._shares = list(zip([0, *ends[:-1]], ends, strict=True))
 
     def iterate(self, theta: FloatArray, x0: list[FloatArray]) -> Iterate:
         """Simulate at a point."""
@@ -80,7 +82,7 @@ class Problem:
 
     def per_recording(self, values: AnyArray) -> list[AnyArray]:
         """Split what is known per window into recordings."""
-        return np.split(values, np.cumsum(self.counts)[:-1])
+        return [values[first:last] for first, last in self._shares]
 
     def chi2(self, e: FloatArray) -> FloatArray:
         """Return every window's sum of squares."""
@@ -150,7 +152,8 @@ def eliminate(
         (W, n) and (W, n, p) array: start states that explain the rest, in units of their scales.
     """
     J, Jx = derivatives
-    left = np.column_stack([e, J])
+    left = np.empty((e.size, 1 + J.shape[1]))
+    left[:, 0], left[:, 1:] = e, J
     try:
         gains = _freed(left, Jx, problem.first, problem.last, damping)
     except np.linalg.LinAlgError as failure:

@@ -203,9 +203,7 @@ def fit(
     point = parametrisation.centre.copy() if theta is None else theta.copy()
     problem = Problem(parametrisation, data)
     sim = parametrisation.simulator(point)
-    problem.scales = sim.state_sizes(
-        [r.u for r in data.driving], [r.y[g] for r, g in zip(data.recordings, data.good, strict=True)]
-    )
+    problem.scales = sim.state_sizes(*data.spans)
     fits_in = x0 is not None and x0[0].shape[1] == sim.order
     states = [x.copy() for x in x0] if x0 is not None and fits_in else start_states(sim, data)
     may = np.ones(point.size, dtype=bool) if free is None else free

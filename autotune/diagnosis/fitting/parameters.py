@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
@@ -81,7 +81,7 @@ class Parametrisation:
         """The effects that the nominal model does not have."""
         return self.model.effects[self.own :]
 
-    @property
+    @cached_property
     def spreads(self) -> FloatArray:
         """Prior standard deviations in units of the search."""
         return np.array([f.spread for f in self.free])

@@ -161,9 +161,7 @@ def _directions(base: Fit, effect: Effect, data: Data) -> tuple[FloatArray, Floa
     added = states[0].shape[1] - base.x0[0].shape[1]
     part = kind_of(effect.name).linear
     first = 0 if part is None or part.at == "front" else states[0].shape[1] - added
-    sizes = p.simulator(theta).state_sizes(
-        [r.u for r in data.driving], [r.y[g] for r, g in zip(data.recordings, data.good, strict=True)]
-    )
+    sizes = p.simulator(theta).state_sizes(*data.spans)
     columns = np.empty((with_it.size, added))
     for k in range(added):
         nudged = tuple(x + NUDGE * sizes[first + k] * (np.arange(x.shape[1]) == first + k) for x in states)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from autotune.arrays import FloatArray
 from autotune.diagnosis.simulation.chain import blocks_of, build_chain, chain_of
 from autotune.diagnosis.simulation.simulator import ICE_K, Simulator, layout
 from autotune.effects import KINDS, kind_of
@@ -128,3 +129,15 @@ def input_size(model: Model, recordings: Sequence[Recording]) -> float:
     except np.linalg.LinAlgError:
         return 1.0
     return 0.1 * readings / static if 0.0 < static < math.inf and readings > 0.0 else 1.0
+
+
+def spans_of(commands: Sequence[FloatArray], readings: Sequence[FloatArray]) -> tuple[float, float]:
+    """Return the largest standard deviation of a command, and of a reading; 0 where there is no reading.
+
+    Parameters
+    ----------
+    commands, readings : sequence of (N,) array
+        Of all recordings.
+    """
+    spread = max((float(np.std(y)) for y in readings if y.size), default=0.0)
+    return max(float(np.std(u)) for u in commands), spread

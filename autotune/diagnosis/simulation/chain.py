@@ -15,7 +15,7 @@ import numpy as np
 from autotune.arrays import FloatArray, IntArray
 from autotune.diagnosis.simulation import kernel
 from autotune.errors import InputError
-from autotune.models import Block, Model
+from autotune.models import Block, Model, TransferFunction
 
 #: Positions in a chain's ``where``.
 ACTUATOR, SPEED, POSITION = range(3)
@@ -101,16 +101,14 @@ class Chain:
 
 def _realise(block: Block) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Return A, b, c, d of one block."""
+    if len(block.dynamics.den) == 2 >= len(block.dynamics.num):
+        return _realise_first_order(block.dynamics)
     den = np.asarray(block.dynamics.den) / block.dynamics.den[0]
     num = np.zeros(den.size)
     num[den.size - len(block.dynamics.num) :] = np.asarray(block.dynamics.num) / block.dynamics.den[0]
     n = den.size - 1
     direct = float(num[0])
     rest = num[1:] - direct * den[1:]
-    if n == 1:
-        if rest[0] == 0.0:
-            return np.array([[-den[1]]]), np.array([0.0]), np.array([1.0]), direct
-        return np.array([[-den[1]]]), np.array([rest[0]]), np.array([1.0]), direct
     A = np.zeros((n, n))
     b = np.zeros(n)
     if n:
@@ -118,6 +116,14 @@ def _realise(block: Block) -> tuple[FloatArray, FloatArray, FloatArray, float]:
         A[-1] = -den[:0:-1]
         b[-1] = 1.0
     return A, b, rest[::-1].copy(), direct
+
+
+def _realise_first_order(dynamics: TransferFunction) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Return the same of a block of first order, whose state is its output; a fit builds hundreds of thousands."""
+    lead, last = dynamics.den
+    rate = last / lead
+    direct = dynamics.num[0] / lead if len(dynamics.num) == 2 else 0.0
+    return np.array([[-rate]]), np.array([dynamics.num[-1] / lead - direct * rate]), np.array([1.0]), direct
 
 
 def build_chain(model: Model) -> Chain:

@@ -20,7 +20,7 @@ import textwrap
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 
 from autotune.arrays import FloatArray
@@ -51,7 +51,11 @@ class Layout:
 
     def flag(self, name: str) -> int:
         """Return the position of an effect's flag, -1 for one without lines."""
-        return next((i for i, kind in enumerate(self.kinds) if kind.name == name), -1)
+        return self._flags.get(name, -1)
+
+    @cached_property
+    def _flags(self) -> dict[str, int]:
+        return {kind.name: i for i, kind in enumerate(self.kinds)}
 
 
 def layout_of(kinds: Sequence[EffectKind]) -> Layout:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray
-from autotune.diagnosis.simulation.assembly import assemble, input_size
+from autotune.diagnosis.simulation.assembly import assemble, input_size, spans_of
 from autotune.diagnosis.simulation.simulator import Simulator, Windows
 from autotune.effects import kind_of
 from autotune.errors import InputError
@@ -163,7 +163,7 @@ def forecast(model: Model, recording: Recording, horizon_s: float | None = None)
         linear=sim.linear(),
         recording=recording,
         good=good.astype(np.float64),
-        scales=sim.state_sizes([recording.u], [recording.y[good]]),
+        scales=sim.state_sizes(*spans_of([recording.u], [recording.y[good]])),
         bias_size=input_size(model, [recording]),
         dt_s=recording.sample_time_s,
     )

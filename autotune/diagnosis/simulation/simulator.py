@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, lru_cache
 
@@ -45,6 +44,11 @@ class Windows:
         """First rows, rows after the last, and where each window begins in the output, (3, W)."""
         places = self.starts if self.places is None else self.places
         return np.stack((self.starts, self.stops, places)).astype(np.int64)
+
+    @cached_property
+    def last_row(self) -> int:
+        """The row before which the last window ends, 0 without one."""
+        return int(self.stops.max(initial=0))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -123,10 +127,16 @@ class Simulator:
 
     def step_s(self, dt_s: float) -> float:
         """Return the longest sub-step [s] for a sample time: shorter where forces change within a sample."""
-        pieces = _LINEAR if self.linear_hold else 1
-        if any(_acts_at(kind, *_FORCED) for kind in self.kinds):
+        pieces, is_forced = self._pieces
+        if is_forced:
             pieces = max(pieces, math.ceil(self.chain.fastest_of_plant * dt_s / _FASTEST))
-        return dt_s / min(max(pieces, *(kind.sub_steps for kind in self.kinds), 1), _MOST)
+        return dt_s / min(pieces, _MOST)
+
+    @cached_property
+    def _pieces(self) -> tuple[int, bool]:
+        """Sub-steps of a sample at least, whatever its length, and whether forces ask for more."""
+        least = max(_LINEAR if self.linear_hold else 1, *(kind.sub_steps for kind in self.kinds), 1)
+        return least, any(_acts_at(kind, *_FORCED) for kind in self.kinds)
 
     def run(
         self,
@@ -166,30 +176,37 @@ class Simulator:
         chain, (rows, count) = self.chain, _rows(windows, len(recording))
         states = np.empty((2, rows.shape[1], chain.order))
         states[0] = x0
-        place = (step, chain.delay_s, self.u_offset, self.y_offset, self.kelvin, float(chain.is_static))
-        numbers = np.concatenate([place, chain.gains, self.values])
-        flags = np.concatenate([(number, signals, *self._flags, count), self.acts])
+        numbers, flags = self._numbers.copy(), self._flags.copy()
+        numbers[kernel.STEP] = step
+        flags[kernel.NUMBER], flags[kernel.SIGNALS_ASKED], flags[kernel.ROWS] = number, signals, count
         out = self.compiled(
             _driven(recording), rows, states, _tables(chain, self.falling, step), chain.taps, numbers, flags
         )
         return out.T, states[1]
 
     @cached_property
-    def _flags(self) -> tuple[int, ...]:
-        """Return what the compiled simulation may leave out, see the positions in its body."""
+    def _numbers(self) -> FloatArray:
+        """What the compiled simulation is told in numbers; the step is filled in by each run."""
+        place = (0.0, self.chain.delay_s, self.u_offset, self.y_offset, self.kelvin, float(self.chain.is_static))
+        return np.concatenate([place, self.chain.gains, self.values])
+
+    @cached_property
+    def _flags(self) -> IntArray:
+        """What it may leave out, see the positions in its body; each run fills in number, signals and rows."""
         directional = self.falling is not self.chain
         forced = any(_acts_at(kind, *_FORCED) for kind in self.kinds)
         driven = any(_acts_at(kind, "converter", "command", "stop") for kind in self.kinds)
         others = tuple(name for name in _FORCED if name != "friction")
         rubbed = forced and self.order == 2 and not any(_acts_at(kind, *others) for kind in self.kinds)
-        return (
-            int(self.linear_hold), int(directional), *self.chain.where, int(forced),
+        told = (
+            0, 0, int(self.linear_hold), int(directional), *self.chain.where, int(forced),
             *(int(any(_acts_at(kind, stage) for kind in self.kinds)) for stage in _TOLD),
             int(any(_acts_at(kind, "sensor", "reading") for kind in self.kinds)),
             int(not (forced or driven or directional or self.linear_hold)),
             int(rubbed and not (driven or directional or self.linear_hold)),
-            int(any(kind.memory is not None and kind.memory.replayed for kind in self.kinds)),
+            int(any(kind.memory is not None and kind.memory.replayed for kind in self.kinds)), 0,
         )  # fmt: skip
+        return np.concatenate([np.array(told, dtype=np.int64), self.acts])
 
     def rest_state(self, u: float, y: float) -> FloatArray:
         """Return the state nearest to rest under a command that gives a reading.
@@ -216,17 +233,15 @@ class Simulator:
         rhs = np.vstack([np.outer(-chain.B[:, 0] / scale, u - self.u_offset), weight * (y - self.y_offset)])
         return np.ascontiguousarray(np.linalg.lstsq(lhs, rhs, rcond=1e-12)[0].T)
 
-    def state_sizes(self, commands: Sequence[FloatArray], readings: Sequence[FloatArray]) -> FloatArray:
+    def state_sizes(self, span: float, spread: float) -> FloatArray:
         """Return a size for every state: what the command's span makes of it, bounded by what the readings show.
 
         Parameters
         ----------
-        commands, readings : sequence of (N,) array
-            Of all recordings. Where no command moves, a state has the size that moves the reading by its spread, by
-            free motion from there.
+        span, spread : float
+            Of all recordings, see :func:`autotune.diagnosis.simulation.assembly.spans_of`. Where no command moves, a
+            state has the size that moves the reading by its spread, by free motion from there.
         """
-        span = max(float(np.std(u)) for u in commands)
-        spread = max((float(np.std(y)) for y in readings if y.size), default=0.0)
         A, b, tap = self.chain.A, self.chain.B[:, 0], self.chain.taps[kernel.OUTPUT]
         if span == 0.0 < spread:
             fastest = max(float(np.abs(np.linalg.eigvals(A)).max()), 1e-9)
@@ -276,6 +291,6 @@ def _rows(windows: Windows | None, count: int) -> tuple[IntArray, int]:
     """
     if windows is None:
         return np.array([[0], [count], [0]], dtype=np.int64), count
-    if windows.stops.size and windows.stops.max() > count:
-        raise ValueError(f"a window ends at row {windows.stops.max()} of {count}")
+    if windows.last_row > count:
+        raise ValueError(f"a window ends at row {windows.last_row} of {count}")
     return windows.table, count if windows.rows is None else windows.rows

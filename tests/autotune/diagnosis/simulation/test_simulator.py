@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 
 from autotune.diagnosis.fitting.parameters import effect_with
-from autotune.diagnosis.simulation.assembly import assemble
+from autotune.diagnosis.simulation.assembly import assemble, spans_of
 from autotune.diagnosis.simulation.simulator import Windows
 from autotune.errors import InputError
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
@@ -158,7 +158,7 @@ def test_dry_friction_alone_is_simulated_as_beside_a_load_of_nothing(
 def test_a_recording_of_which_no_row_counts_says_nothing_of_the_states_sizes() -> None:
     sim = assemble(servo())
     u, y = np.array([0.0, 1.0, 0.0]), np.array([0.0, 2.0, 1.0])
-    alone, nothing = sim.state_sizes([u], [y]), y[:0]
-    assert np.array_equal(sim.state_sizes([u, u], [nothing, y]), alone)
-    assert np.array_equal(sim.state_sizes([u, u], [y, nothing]), alone)
-    assert np.all(np.isfinite(sim.state_sizes([u], [nothing])))
+    alone, nothing = sim.state_sizes(*spans_of([u], [y])), y[:0]
+    assert np.array_equal(sim.state_sizes(*spans_of([u, u], [nothing, y])), alone)
+    assert np.array_equal(sim.state_sizes(*spans_of([u, u], [y, nothing])), alone)
+    assert np.all(np.isfinite(sim.state_sizes(*spans_of([u], [nothing]))))
