@@ -139,8 +139,8 @@ def to_parquet(path: Path, out: Path, wanted: Sequence[str], export: ExportSetti
                     columns = [stamps, *(_with_decimal_point(batch.column(name), table.decimal) for name in kept)]
                     writer.write_table(pa.Table.from_arrays(columns, schema=pa.schema(fields)))
                     advance(path.name, file.tell() / size)
-        with part.open("rb+") as file:
-            os.fsync(file.fileno())
+        with part.open("rb+") as written:
+            os.fsync(written.fileno())
         part.replace(out)
     except pa.ArrowInvalid as error:
         said = str(error).strip().splitlines()[0]
