@@ -127,7 +127,7 @@ def to_parquet(path: Path, out: Path, wanted: Sequence[str], export: ExportSetti
     stamp = stamp_form(table, time, export.form())
     kept = [name for name in wanted if name in table.names and name not in time]
     read, parse, convert = options([*time, *kept])
-    part, size = out.with_suffix(".part"), max(path.stat().st_size, 1)
+    part, size = out.with_name(f".part-{out.stem}"), max(path.stat().st_size, 1)
     try:
         with path.open("rb") as file, pyarrow.csv.open_csv(file, read, parse, convert) as reader:
             fields = [pa.field(time[0], pa.timestamp("us")), *(pa.field(name, pa.string()) for name in kept)]
