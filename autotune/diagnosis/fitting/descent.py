@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -106,16 +107,20 @@ class Problem:
         J = np.zeros((iterate.e.size, iterate.theta.size))
         for i in np.flatnonzero(may):
             J[:, i] = self._column(int(i), iterate.theta, iterate.x0, iterate.e)
-        Jx = np.empty((iterate.e.size, iterate.sim.order))
-        for j in range(iterate.sim.order):
+        return J, self.state_columns(iterate, range(iterate.sim.order))
+
+    def state_columns(self, iterate: Iterate, which: Sequence[int]) -> FloatArray:
+        """Return de/dx0 (N, s) of some states in units of their scales, all windows' states moved at once."""
+        columns = np.empty((iterate.e.size, len(which)))
+        for k, j in enumerate(which):
             h = 1e-3 * self.scales[j]
             shifted = [x.copy() for x in iterate.x0]
             for x in shifted:
                 x[:, j] += h
             moved = self.data.whitened_runs(simulate(iterate.sim, shifted, self.data)[0])
             column = (moved - iterate.e) * (self.scales[j] / h)
-            Jx[:, j] = column if bounded(column) else 0.0
-        return J, Jx
+            columns[:, k] = column if bounded(column) else 0.0
+        return columns
 
     def inherited(self, theta: FloatArray, x0: list[FloatArray], e: FloatArray, smaller: Derivatives) -> Derivatives:
         """Return derivatives that take a smaller model's for the numbers they share, new ones for the rest."""

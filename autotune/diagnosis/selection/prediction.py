@@ -10,16 +10,14 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.diagnosis.fitting.bases import basis
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.descent import bounded
-from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, residual_at
+from autotune.diagnosis.fitting.descent import Iterate, Problem, bounded
+from autotune.diagnosis.fitting.fit import RUNAWAY, Fit
 from autotune.diagnosis.fitting.parameters import Parametrisation, effect_with, parametrise
 from autotune.effects import kind_of
 from autotune.effects.base import EffectKind, SignalSizes
 from autotune.errors import IdentificationError
 from autotune.models import Effect, Model
 
-#: Share of its size by which a start state is moved for its derivative.
-NUDGE = 1e-3
 #: Most simulations of one effect while it is shrunk, and the share of chi2 that a simulation counts that ran away.
 SHRINKINGS, RAN_AWAY = 4, 1e6
 #: One turn in units of an angle.
@@ -149,25 +147,28 @@ def direction(base: Fit, effect: Effect, data: Data) -> FloatArray:
     AutotuneError, OverflowError, LinAlgError
         The simulation runs away with the effect.
     """
-    return _directions(base, effect, data)[0]
+    return _moved(base, effect, data)[0]
 
 
-def _directions(base: Fit, effect: Effect, data: Data) -> tuple[FloatArray, FloatArray]:
-    """Return that direction (N,), and those of the start states that the effect adds (N, s), all windows at once."""
+def _moved(base: Fit, effect: Effect, data: Data) -> tuple[FloatArray, Problem, Iterate]:
+    """Return that direction (N,), with the extended fit's problem and where it stands with the effect."""
     p, theta, states = extend(base, effect, data)
-    with_it = residual_at(p, data, theta, states)
-    if not bounded(with_it - base.e):
+    problem = Problem(p, data)
+    there = problem.iterate(theta, list(states))
+    if not bounded(there.e - base.e):
         raise IdentificationError("the simulation runs away", where=effect.name)
-    added = states[0].shape[1] - base.x0[0].shape[1]
+    return base.without_states(there.e - base.e), problem, there
+
+
+def _added_states(base: Fit, effect: Effect, problem: Problem, there: Iterate) -> FloatArray:
+    """Return how the start states that an effect adds move the whitened residual, (N, s), freed of the others."""
+    order, added = there.sim.order, there.sim.order - base.sim.order
     part = kind_of(effect.name).linear
-    first = 0 if part is None or part.at == "front" else states[0].shape[1] - added
-    sizes = p.simulator(theta).state_sizes(*data.spans)
-    columns = np.empty((with_it.size, added))
-    for k in range(added):
-        nudged = tuple(x + NUDGE * sizes[first + k] * (np.arange(x.shape[1]) == first + k) for x in states)
-        column = residual_at(p, data, theta, nudged) - with_it
-        columns[:, k] = base.without_states(column) / NUDGE if bounded(column) else 0.0
-    return base.without_states(with_it - base.e), columns
+    if part is None or added <= 0:
+        return np.empty((there.e.size, 0))
+    problem.scales = there.sim.state_sizes(*problem.data.spans)
+    columns = problem.state_columns(there, range(added) if part.at == "front" else range(order - added, order))
+    return np.column_stack([base.without_states(column) for column in columns.T])
 
 
 def distinct_starts(group: Sequence[Prediction]) -> list[Effect]:
@@ -192,11 +193,12 @@ def _predicted(base: Fit, effect: Effect, data: Data) -> tuple[Prediction, float
     kind = kind_of(effect.name)
     nothing = Prediction(effect=effect, decrease=0.0, scaled=effect)
     try:
-        d, added = _directions(base, effect, data)
+        d, problem, there = _moved(base, effect, data)
+        added = _added_states(base, effect, problem, there)
     except RUNAWAY:
         return nothing, RAN_AWAY
     # the fit is at rest: its numbers have nothing to gain by themselves, and their priors are weighed with chi2
-    e, d = _without(base, added, base.e), _without(base, added, d)
+    e, d = _without(base, added, np.stack([base.e, d]))
     slope, curvature = -float(d @ e), float(d @ base.without_numbers(d))
     if curvature == 0.0:
         return nothing, 0.0
@@ -206,20 +208,21 @@ def _predicted(base: Fit, effect: Effect, data: Data) -> tuple[Prediction, float
     a = float(np.clip(slope / curvature, low, high))
     scaled = _scaled(effect, a, 20.0 if kind.is_signed else 2.0)
     least = min(data.thresholds.beyond_chance, curvature) if kind.impacts else 0.0
-    # what each start state explains by chance does not count
-    by_states = base.chi2 - float(e @ e) - len(base.windows) * added.shape[1] * max(1.0, base.chi2 / base.rows)
+    # what each start state explains by chance does not count; 0 to the bit of an effect that adds none
+    taken, chance = base.e - e, len(base.windows) * added.shape[1] * max(1.0, base.chi2 / base.rows)
+    by_states = float(taken @ taken) - chance
     decrease = max(2.0 * a * slope - a * a * curvature + max(by_states, 0.0), least)
     return Prediction(effect=effect, decrease=decrease, scaled=scaled), curvature / base.chi2
 
 
-def _without(base: Fit, added: FloatArray, direction: FloatArray) -> FloatArray:
-    """Return what is left of a direction when the start states that an effect adds may move against it as well."""
+def _without(base: Fit, added: FloatArray, directions: FloatArray) -> FloatArray:
+    """Return what is left of directions (k, N) when the start states that an effect adds may move as well."""
     if added.shape[1] == 0:
-        return direction
-    left = direction.copy()
+        return directions
+    left = directions.copy()
     for a, b in base.windows:
         Q = basis(added[a:b])
-        left[a:b] -= Q @ (Q.T @ left[a:b])
+        left[:, a:b] -= (left[:, a:b] @ Q) @ Q.T
     return left
 
 
