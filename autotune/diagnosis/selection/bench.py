@@ -97,9 +97,13 @@ class Bench:
         """Return a fit to short windows from one to long windows: start states first, then the numbers as well."""
         return fit_from(result.parametrisation, self.few, result.theta, iterations=STEPS)
 
+    def in_units_of(self, one: JudgedChain) -> Self:
+        """Return the bench in the units that a hypothesis was fitted in, for what is fitted on from it."""
+        return self if one.data.noise.sd == self.long.noise.sd else self._at(one.data.noise.sd)
+
     def finished(self, one: JudgedChain) -> JudgedChain | None:
         """Return a hypothesis fitted to the end, at the residual that it leaves; nothing if not better so."""
-        bench = self._at(one.data.noise.sd)
+        bench = self.in_units_of(one)
         try:
             result = fit(one.fit.parametrisation, bench.long, one.fit.theta, one.fit.x0, iterations=LAST_STEPS)
         except RUNAWAY:
@@ -108,7 +112,7 @@ class Bench:
             return None
         return bench.judged(result, one.log_odds)
 
-    def _at(self, sd: float) -> Bench:
+    def _at(self, sd: float) -> Self:
         """Return the bench at another residual of long windows, that of short ones in proportion."""
         return self.with_sd(sd, self.few.noise.sd * sd / self.long.noise.sd)
 

@@ -95,22 +95,22 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
         """Return hypotheses with one effect more than those of a beam, the most promising ones."""
         starts: list[_Start] = []
         for base in beam:
-            found = _starts(base, self)
+            found = _starts(base, self.in_units_of(base))
             if base.leaves_noise:
                 found = [s for s in found if s.decrease > PROMISING * _charge(s)]
             found.sort(key=lambda s: -s.decrease - 2.0 * math.log(s.odds))
             starts += [s for k, s in enumerate(found) if k < self.limits.tried or s.odds >= PRIOR_ODDS["usual"]]
-        fits = self.pool.map(lambda s: _fit_added(s, self), starts)
-        best: dict[frozenset[str], tuple[Fit, float, JudgedChain]] = {}
-        for s, result in zip(starts, fits, strict=True):
+        best: dict[frozenset[str], tuple[Fit, _Start]] = {}
+        for s, result in zip(starts, self.pool.map(_fit_added, starts), strict=True):
             if result is None or result.cost > s.base.fit.cost - 0.3:
                 continue
-            key, log_odds = frozenset((*s.base.names, s.kind.name)), s.base.log_odds + math.log(s.odds)
-            if key not in best or result.cost < best[key][0].cost:
-                best[key] = result, log_odds, s.base
-        order = sorted(best.values(), key=lambda one: one[0].cost - 2.0 * one[1])
-        able = [[one for one in order if one[2] is base][: self.limits.tried] for base in beam]
-        done = self.pool.map(lambda one: self.judged(one[0], one[1]), [one for group in able for one in group])
+            key = frozenset((*s.base.names, s.kind.name))
+            if key not in best or _absolute(result, s.bench) < _absolute(best[key][0], best[key][1].bench):
+                best[key] = result, s
+        order = sorted(best.values(), key=lambda one: one[0].cost - 2.0 * one[1].log_odds)
+        able = [[one for one in order if one[1].base is base][: self.limits.tried] for base in beam]
+        chosen = [one for group in able for one in group]
+        done = self.pool.map(lambda one: one[1].bench.judged(one[0], one[1].log_odds), chosen)
         return [j for j in done if j is not None]
 
     def beside(self, best: JudgedChain) -> _ChainProposals:
@@ -132,7 +132,7 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
         def judge_without(one: JudgedChain, index: int) -> JudgedChain | None:
             fewer = fit_without(one.fit, index, one.data)
             own = sum(given.get(n, -math.inf) for i, n in enumerate(one.names) if i != index)
-            return None if fewer is None else self.judged(fewer, max(own, one.log_odds))
+            return None if fewer is None else self.in_units_of(one).judged(fewer, max(own, one.log_odds))
 
         each = at_once(lambda one: list(self.pool.map(partial(judge_without, one), range(len(one.names)))), some)
         return [j for group in each for j in group if j is not None]
@@ -197,14 +197,20 @@ def _refit_larger(found: Sequence[JudgedChain], bench: Bench) -> list[JudgedChai
 def _fit_from_best(best: JudgedChain, larger: JudgedChain, bench: Bench) -> JudgedChain | None:
     """Return a hypothesis fitted from another one's numbers, with the effect that it has besides as it was found."""
     effect = next(e for e in larger.fit.model.effects if e.name in set(larger.names) - set(best.names))
+    bench = bench.in_units_of(best)
     try:
         p, theta, states = extend(best.fit, effect, bench.long)
         result = fit(p, bench.long, theta, states, iterations=LAST_STEPS, inherit=best.fit)
     except RUNAWAY:
         return None
-    if result.cost >= larger.fit.cost:
+    if _absolute(result, bench) >= _absolute(larger.fit, bench.in_units_of(larger)):
         return None
     return bench.judged(result, larger.log_odds)
+
+
+def _absolute(result: Fit, bench: Bench) -> float:
+    """Return a fit's cost in the reading's unit squared, from units of the bench that it was fitted on."""
+    return result.cost * bench.long.noise.sd**2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -212,12 +218,18 @@ class _Start:
     """An effect to be added to a hypothesis: where from, at which scale, and what the first order predicts."""
 
     base: JudgedChain
+    bench: Bench
     kind: EffectKind
     odds: float
     effects: tuple[Effect, ...]
     near: Fit
     data: Data
     decrease: float
+
+    @property
+    def log_odds(self) -> float:
+        """Logarithm of the prior odds of all effects of the hypothesis."""
+        return self.base.log_odds + math.log(self.odds)
 
 
 def _charge(start: _Start) -> float:
@@ -250,8 +262,9 @@ def _starts(base: JudgedChain, bench: Bench) -> list[_Start]:
         order = sorted((p for _ in group for p in next(predicted)), key=lambda p: -p.decrease)
         few = tuple(distinct_starts(order)[: bench.limits.followed])
         if few:
+            most = order[0].decrease
             found.append(
-                _Start(base=base, kind=kind, odds=odds, effects=few, near=near, data=data, decrease=order[0].decrease)
+                _Start(base=base, bench=bench, kind=kind, odds=odds, effects=few, near=near, data=data, decrease=most)
             )
     return found
 
@@ -264,9 +277,10 @@ def _starting_points(kind: EffectKind, near: Fit, data: Data, sizes: SignalSizes
     return tried + (search_starts(kind.name, near, data, bench.pool) if kind.search is not None else [])
 
 
-def _fit_added(start: _Start, bench: Bench) -> Fit | None:
+def _fit_added(start: _Start) -> Fit | None:
     """Return the best fit of a hypothesis with one more effect to long windows; nothing where all run away."""
     done: list[Fit] = []
+    bench = start.bench
     steps = 2 * STEPS if start.kind.rough else STEPS
     for effect in start.effects:
         try:

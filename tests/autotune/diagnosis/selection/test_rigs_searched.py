@@ -19,8 +19,10 @@ from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.effects import ALL, related_effects
 from autotune.effects.rigs import rig_kind
+from autotune.model_tables import read_model
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
-from autotune.recording import Recording
+from autotune.recording import Recording, read_recording
+from sim.conceal.cases import write as write_case
 
 
 def swing(gravity: float, friction: float, damping: float, *, seconds: float = 20.0, start: float = 1.6) -> Recording:
@@ -249,3 +251,22 @@ def test_numbers_of_what_integrates_do_not_hang_on_which_of_its_fits_is_taken():
     assert level(at_both_scales(stuck, [stuck])) != level(at_both_scales(best, [best]))
     assert level(at_both_scales(stuck, [stuck, best])) == level(at_both_scales(best, [stuck, best]))
     assert level(at_both_scales(best, [stuck, best])) == pytest.approx(1.2, rel=0.3)
+
+
+def test_beside_an_effect_that_does_not_lead_alone_the_next_one_is_sought_in_what_that_leaves(tmp_path):
+    """An oven that radiates and a valve that sticks: either alone is too rare to lead, and a first look tells both.
+
+    What an effect promises beside another is counted in units of what the other leaves, not of what both leave.
+    """
+    write_case(310219, tmp_path, tmp_path / "answer.json")
+    recordings = [read_recording(tmp_path / name) for name in ("rec1.csv", "rec2.csv")]
+    both = {"plant.radiation_loss", "actuator.stiction"}
+    events = {"environment.loss_step", "environment.gain_step", "actuator.gain_drift", "timing.clock_error"}
+    lags = {"actuator.lag", "sensor.lag", "timing.dead_time"}
+    others = {"actuator.backlash", "actuator.saturation"}
+    found = search_chain(
+        read_model(tmp_path / "model.toml"), recordings, [np.isfinite(r.y) for r in recordings],
+        left_out=[k.name for k in ALL if k.name not in both | events | lags | others],
+        limits=replace(IN_USE, rig_effects=2),
+    )  # fmt: skip
+    assert set(found.chosen.names) == both
