@@ -75,7 +75,7 @@ def identify_delay_command(
 
     place = Output(out, inputs=(recording,), overwrite=overwrite)  # refused before the method is imported
     from autotune.api import methods
-    from autotune.identification.delay.model import DelayModel, write_delay_model
+    from autotune.identification.delay.model import DelayModel
 
     record = read_one(recording, signal_names(t, u, y, r))
     if hold is not None:
@@ -92,12 +92,9 @@ def identify_delay_command(
             settings = {} if start_delay is None else {"start_s": start_delay}
             settings |= {"forgetting": forgetting} if method == "online" else {}
         model = methods.delay(record, order, method=method, delays=delays, interval_s=interval, **settings)
-    if isinstance(model, DelayModel):
-        place.by(lambda part: write_delay_model(model, part))
-        typer.echo(f"{describe(model)}; wrote {out}")
-    else:
-        place.json(model.to_json())
-        typer.echo(f"{_describe_two(model)}\nwrote {out}")
+    place.json(model.to_json())
+    said = f"{describe(model)}; " if isinstance(model, DelayModel) else f"{_describe_two(model)}\n"
+    typer.echo(f"{said}wrote {out}")
 
 
 def _describe_two(model: TwoDelays) -> str:

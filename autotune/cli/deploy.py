@@ -14,6 +14,7 @@ from autotune.cli import app
 from autotune.cli.common import ProgressBar, rig_of
 from autotune.controller_forms import FORMS
 from autotune.errors import AutotuneError, ExperimentStopped, InputError
+from autotune.whole_files import jsonable, write_json
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -71,7 +72,7 @@ def deploy(
     from autotune.pipeline.deployment import deploy as hand_over
     from autotune.pipeline.folder import JOURNAL, next_free
     from autotune.pipeline.held_gains import round_to_rig
-    from autotune.pipeline.result import verification_json, write_json
+    from autotune.pipeline.result import verification_json
     from autotune.pipeline.sensible_gains import require_sensible
     from autotune.report.page import write_page
     from autotune.report.run_page import deployment_page
@@ -107,16 +108,14 @@ def deploy(
     done = hand_over(rig, new, folder / JOURNAL, agree=agree, try_out=trial, audit=audit)
     verification = done.verification
     result = next_free(folder / "deploy.json", ".html")
-    write_json(
-        {
-            "old": asdict(done.old),
-            "new": asdict(done.new),
-            "kept": done.kept,
-            "verified": verification.whose if verification is not None else "not verified",
-            "verification": verification_json(verification) if verification is not None else None,
-        },
-        result,
-    )
+    said = {
+        "old": asdict(done.old),
+        "new": asdict(done.new),
+        "kept": done.kept,
+        "verified": verification.whose if verification is not None else "not verified",
+        "verification": verification_json(verification) if verification is not None else None,
+    }
+    write_json(result, jsonable(said))
     page = deployment_page(content.name, content.signals, done)
     write_page(page, result.with_suffix(".html"))
     console.print(page.verdict, markup=False)
@@ -134,7 +133,7 @@ def verify(
     from autotune.experiment.rig import HoldsGains
     from autotune.pipeline.deployment import read_gains
     from autotune.pipeline.folder import next_free
-    from autotune.pipeline.result import verification_json, write_json
+    from autotune.pipeline.result import verification_json
     from autotune.report.page import write_page
     from autotune.report.run_page import verification_page
 
@@ -147,7 +146,8 @@ def verify(
     folder.mkdir(parents=True, exist_ok=True)
     verification = _verify(rig, content, gains, fit, measured, folder, on_device=own)
     result = next_free(folder / "verify.json", ".html")
-    write_json({"controller": asdict(gains), "verification": verification_json(verification)}, result)
+    said = {"controller": asdict(gains), "verification": verification_json(verification)}
+    write_json(result, jsonable(said))
     page = verification_page(content.name, content.signals, gains, verification)
     write_page(page, result.with_suffix(".html"))
     console = Console(highlight=False, soft_wrap=True)

@@ -12,7 +12,7 @@ from autotune.design.nugap import Validation
 from autotune.pipeline.analysis import Analysis
 from autotune.pipeline.folder import CONTROLLER
 from autotune.points import points_to_json
-from autotune.whole_files import jsonable, write_whole
+from autotune.whole_files import jsonable, write_json
 
 if TYPE_CHECKING:  # a recording is tuned without a rig and without a diagnosis
     from autotune.diagnosis.result import Diagnosis
@@ -58,7 +58,7 @@ def write_result(
         write_controller(analysis.controller, path.with_name(CONTROLLER))
     if verification is not None:
         content["verification"] = verification_json(verification)
-    write_json(content, path)
+    write_json(path, jsonable(content))
 
 
 def append_diagnosis(path: Path, found: Diagnosis) -> None:
@@ -74,20 +74,7 @@ def append_diagnosis(path: Path, found: Diagnosis) -> None:
     said = found.as_json()
     content = json.loads(path.read_text(encoding="utf-8"))
     content["diagnosis"] = {key: said[key] for key in ("verdict", "effects", "places", "next_experiment")}
-    write_json(content, path)
-
-
-def write_json(content: dict[str, Any], path: Path) -> None:
-    """Write a result file; what JSON has no number for becomes null.
-
-    Parameters
-    ----------
-    content : dict
-        What is written.
-    path : Path
-        Replaced where it exists.
-    """
-    write_whole(path, json.dumps(jsonable(content), indent=2, allow_nan=False) + "\n")
+    write_json(path, jsonable(content))
 
 
 def analysis_json(analysis: Analysis) -> dict[str, Any]:

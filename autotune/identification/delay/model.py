@@ -13,7 +13,6 @@ from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import InputError
 from autotune.models import TransferFunction
 from autotune.text_files import read_json
-from autotune.whole_files import write_json
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -103,19 +102,6 @@ class DelayModel:
 def _or_null(values: FloatArray) -> list[float | None]:
     """Return numbers for JSON, null for what has none."""
     return [float(value) if math.isfinite(value) else None for value in values]
-
-
-def write_delay_model(model: DelayModel, path: str | os.PathLike[str]) -> None:
-    """Write ``delay.json``.
-
-    Parameters
-    ----------
-    model : DelayModel
-        What is written.
-    path : path
-        Replaced where it exists.
-    """
-    write_json(path, model.to_json())
 
 
 def read_delay_model(path: str | os.PathLike[str]) -> DelayModel:

@@ -318,11 +318,12 @@ def test_cost_is_the_sum_of_squares_and_the_gram_matrix_is_linear_in_rows():
 
 
 def test_delay_model_file_round_trip(tmp_path):
-    from autotune.identification.delay.model import read_delay_model, write_delay_model
+    from autotune.identification.delay.model import read_delay_model
+    from autotune.whole_files import write_json
 
     model = identify_delay(noisy(example_2(rate_hz=20.0), 2.0, 11), 2)
     assert isinstance(model, DelayModel)
-    write_delay_model(model, tmp_path / "delay.json")
+    write_json(tmp_path / "delay.json", model.to_json())
     back = read_delay_model(tmp_path / "delay.json")
     assert np.array_equal(back.values, model.values)
     assert np.array_equal(back.covariance, model.covariance)
