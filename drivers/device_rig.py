@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 
 from autotune.config.rig import SerialSettings
@@ -13,7 +12,7 @@ from autotune.experiment.relay import RelaySettings
 from autotune.experiment.rig import Reading, Row
 from drivers.kinds import Reach, Session
 from drivers.line_protocol import Command, Frame, Kind
-from drivers.probe import ProbedDevice, probe_line
+from drivers.probe import probe_line
 from drivers.serial_rig import COMMAND, SerialLineRig
 
 _LONGEST_TICKS = 2**32 - 1
@@ -235,14 +234,4 @@ def reach_of(settings: SerialSettings) -> Reach:
     return Reach(device=settings.device)
 
 
-def probe_kind(settings: SerialSettings, expected: Mapping[str, tuple[float, float]]) -> ProbedDevice:
-    """Return who the microcontroller is, a sample and its gains.
-
-    Parameters
-    ----------
-    settings : SerialSettings
-        The table ``[rig]``.
-    expected : mapping of str to (float, float)
-        Range within which a signal's engineering value is plausible.
-    """
-    return probe_line(settings, expected=expected)
+probe_kind = probe_line

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import assert_never
 
 from autotune.config.rig import AnyModbusSettings, ModbusRtuSettings, ModbusTcpSettings, ModbusTlsSettings
@@ -10,7 +9,7 @@ from autotune.experiment.rig import Rig
 from drivers.gain_rig import GainRegisterRig, open_registers
 from drivers.kinds import Reach, Session
 from drivers.modbus import ModbusLink
-from drivers.probe import ProbedRegister, probe
+from drivers.probe import probe
 
 
 def open_kind(settings: AnyModbusSettings, session: Session) -> Rig:
@@ -39,14 +38,4 @@ def reach_of(settings: AnyModbusSettings) -> Reach:
     assert_never(settings)
 
 
-def probe_kind(settings: AnyModbusSettings, expected: Mapping[str, tuple[float, float]]) -> tuple[ProbedRegister, ...]:
-    """Return every mapped register and permissive, read once.
-
-    Parameters
-    ----------
-    settings : AnyModbusSettings
-        The table ``[rig]``.
-    expected : mapping of str to (float, float)
-        Range within which a signal's engineering value is plausible.
-    """
-    return probe(settings, expected=expected)
+probe_kind = probe

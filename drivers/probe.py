@@ -46,7 +46,7 @@ class ProbedRegister:
     warnings: tuple[str, ...]
 
 
-def probe(settings: AnyModbusSettings, *, expected: Mapping[str, tuple[float, float]]) -> tuple[ProbedRegister, ...]:
+def probe(settings: AnyModbusSettings, expected: Mapping[str, tuple[float, float]]) -> tuple[ProbedRegister, ...]:
     """Read every mapped register once; nothing is written.
 
     Parameters
@@ -103,7 +103,7 @@ class ProbedDevice:
     signals: tuple[ProbedSignal, ...]
 
 
-def probe_line(settings: SerialSettings, *, expected: Mapping[str, tuple[float, float]]) -> ProbedDevice:
+def probe_line(settings: SerialSettings, expected: Mapping[str, tuple[float, float]]) -> ProbedDevice:
     """Ask a microcontroller who it is, for a sample and for its gains; nothing is written and no command taken.
 
     Parameters
