@@ -24,7 +24,6 @@ from autotune.identification.closed_loop.confidence import (
     whiteness,
 )
 from autotune.identification.closed_loop.control_law import CONTRADICTION, LawCheck, check_law
-from autotune.identification.closed_loop.design_points import design_points
 from autotune.identification.closed_loop.dither_proposal import DitherLimits, DitherProposal, propose_dither
 from autotune.identification.closed_loop.gaps import usable_stretches
 from autotune.identification.closed_loop.loop_excitation import ExcitationVerdict, judge, own_motion, require_excitation
@@ -300,7 +299,7 @@ def _report(
         pole_covariance=pole_covariance(estimate),
         response=response,
         points=points,
-        design_points=design_points(found, omega),
+        design_points=found.design_points(omega),
         evidence=(),
         excitation=judge(omega, plant, covariance, controller=loop, motion=motion),
         proposal=None,

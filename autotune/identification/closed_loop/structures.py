@@ -6,6 +6,7 @@ several open, whose responses differ by more than each one's own region says.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
@@ -16,8 +17,14 @@ from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError
 from autotune.identification.closed_loop.confidence import frequency_points
 from autotune.identification.closed_loop.hold import without_hold, worthwhile
+from autotune.identification.closed_loop.loop_excitation import critical_frequency
 from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate
 from autotune.points import FrequencyPoint, as_pairs
+
+#: Band of a design's points, as multiples of the frequency at which the plant's phase has fallen to -135 degrees.
+_LOWEST, _HIGHEST = 1.0 / 3.0, 2.0
+#: Fewest points that a reduction can work with.
+_FEWEST = 3
 
 Weighted: TypeAlias = tuple[float, PredictionErrorEstimate]
 
@@ -67,6 +74,29 @@ class Structures:
         plants = [(weight, without_hold(model, points) if points else ()) for weight, model, points in others]
         response = _over(mine, [(weight, points) for weight, _, points in others])
         return response, worthwhile(_over(without_hold(self.chosen.model, mine), plants))
+
+    def design_points(self, grid_rad_s: FloatArray) -> tuple[FrequencyPoint, ...]:
+        """Return points of the plant that may be joined with measured ones and given to a design: as many as it takes.
+
+        n points for n states, at least three, the command's hold taken out, evenly spread in log frequency from a third
+        to twice the frequency at which the plant's phase is -135 degrees; those known to less than 50 % are left out.
+
+        Parameters
+        ----------
+        grid_rad_s : (W,) array
+            Ascending frequencies that the recording can speak of [rad/s].
+
+        Notes
+        -----
+        A design takes points as independent. A model with 2 n numbers has a response that n complex values fix; more
+        points of it would count the same data again. Among these few, errors still are correlated, which each region
+        leaves out.
+        """
+        model, grid = self.chosen.model, np.asarray(grid_rad_s, dtype=np.float64)
+        critical, _ = critical_frequency(grid, model.response(grid)[:, 0, 0], None)
+        low = max(_LOWEST * critical, float(grid[0]))
+        high = min(_HIGHEST * critical, float(grid[-1]), 0.49 * math.pi / model.sample_time_s)
+        return self.points(np.geomspace(low, high, max(_FEWEST, model.order)))[1]
 
 
 def _response(one: PredictionErrorEstimate, omega_rad_s: FloatArray) -> Sequence[FrequencyPoint]:
