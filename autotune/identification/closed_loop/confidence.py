@@ -51,7 +51,7 @@ def response_covariance(estimate: PredictionErrorEstimate, omega_rad_s: FloatArr
     """
     _require_information(estimate)
     change = response_gradient(estimate, omega_rad_s)
-    resolvent = _resolvent(estimate, omega_rad_s)
+    resolvent = estimate.model.resolvent(omega_rad_s)
     alpha = -np.einsum("wki,ikp->wp", resolvent, estimate.d_a)[:, None, None]
     P = estimate.covariance
     second = _mean(alpha, alpha, P).real * _mean(change, change, P).real
@@ -75,7 +75,7 @@ def response_gradient(estimate: PredictionErrorEstimate, omega_rad_s: FloatArray
         Derivatives, in output unit per input unit and unit of the parameter.
     """
     model = estimate.model
-    resolvent = _resolvent(estimate, omega_rad_s)
+    resolvent = model.resolvent(omega_rad_s)
     right, left = resolvent @ model.B, model.C @ resolvent
     change = (
         np.einsum("oip,wiu->woup", estimate.d_c, right)
@@ -84,12 +84,6 @@ def response_gradient(estimate: PredictionErrorEstimate, omega_rad_s: FloatArray
     )
     late = np.exp(-1j * np.asarray(omega_rad_s, dtype=np.float64) * model.sample_time_s * model.input_delay)
     return np.asarray(change * late[:, None, None, None], dtype=np.complex128)
-
-
-def _resolvent(estimate: PredictionErrorEstimate, omega_rad_s: FloatArray) -> ComplexArray:
-    model = estimate.model
-    z = np.exp(1j * np.asarray(omega_rad_s, dtype=np.float64) * model.sample_time_s)
-    return np.asarray(np.linalg.inv(z[:, None, None] * np.eye(model.order) - model.A), dtype=np.complex128)
 
 
 def _mean(a: ComplexArray, b: ComplexArray, covariance: FloatArray) -> ComplexArray:

@@ -114,8 +114,7 @@ def propose_dither(
     G = model.response(omega)[:, 0, 0]
     S = np.ones_like(G) if controller is None else 1.0 / (1.0 + G * controller.response(omega))
     power = np.abs(S) ** 2 * dwell_spectrum(omega, *dwell_s)  # of u, per unit amplitude
-    resolvent = np.linalg.inv(np.exp(1j * omega * dt_s)[:, None, None] * np.eye(model.order) - model.A)
-    H = 1.0 + (model.C @ resolvent @ model.K)[:, 0, 0]
+    H = model.noise_response(omega)[:, 0, 0]
     step = np.gradient(omega)
     weight = power * step / (math.pi * dt_s * np.abs(H) ** 2 * float(model.innovation_covariance[0, 0]))
     inside = (omega >= band_rad_s[0]) & (omega <= band_rad_s[1])

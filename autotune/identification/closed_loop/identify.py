@@ -30,7 +30,6 @@ from autotune.identification.closed_loop.loop_excitation import ExcitationVerdic
 from autotune.identification.closed_loop.order import Candidate, choose_order, default_past_window, fit_order
 from autotune.identification.closed_loop.prediction_error import PredictionErrorEstimate
 from autotune.identification.closed_loop.series import Series
-from autotune.identification.closed_loop.state_space import InnovationModel
 from autotune.identification.closed_loop.structures import Structures, Weighted
 from autotune.identification.closed_loop.subspace_direct import lagged_data
 from autotune.points import FrequencyPoint
@@ -248,20 +247,10 @@ def _in_units(
     estimate: PredictionErrorEstimate, scale_u: float, scale_y: float, sample_time_s: float
 ) -> PredictionErrorEstimate:
     """Return an estimate made on scaled signals (u / scale_u, y / scale_y) in the signals' own units."""
-    model, ratio = estimate.model, scale_y / scale_u
-    scaled = InnovationModel(
-        A=model.A,
-        B=model.B / scale_u,
-        C=model.C * scale_y,
-        D=model.D * ratio,
-        K=model.K / scale_y,
-        innovation_covariance=model.innovation_covariance * scale_y**2,
-        sample_time_s=sample_time_s,
-        input_delay=model.input_delay,
-    )
+    model = estimate.model
     return replace(
         estimate,
-        model=scaled,
+        model=model.in_units(np.array([scale_u]), np.array([scale_y]), sample_time_s),
         d_b=estimate.d_b / scale_u,
         d_c=estimate.d_c * scale_y,
         d_k=estimate.d_k / scale_y,

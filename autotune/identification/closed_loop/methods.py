@@ -146,7 +146,7 @@ def closed_loop_model(
         r_1 = (r - r.mean(axis=0)) / scale_u
         markov = None if controller_markov is None else controller_markov * scale_y / scale_u[:, None]
         model = _by_excitation(r_1, u_1, y_1, order, method, markov, windows)
-    return _in_units(model, scale_u, scale_y, sample_time_s)
+    return model.in_units(scale_u, scale_y, sample_time_s)
 
 
 def _direct(u: FloatArray, y: FloatArray, order: int, method: Method, windows: Windows) -> InnovationModel:
@@ -186,21 +186,6 @@ def _by_excitation(
         r, u, y, order, controller_markov=markov, f=f, p=p, loop_order=windows.n_cl, instrument=instrument
     )
     return refit_inputs(found, u, y) if method == "indirect-refitted" else found
-
-
-def _in_units(
-    model: InnovationModel, scale_u: FloatArray, scale_y: FloatArray, sample_time_s: float
-) -> InnovationModel:
-    return InnovationModel(
-        A=model.A,
-        B=model.B / scale_u,
-        C=model.C * scale_y[:, None],
-        D=model.D * scale_y[:, None] / scale_u,
-        K=model.K / scale_y,
-        innovation_covariance=model.innovation_covariance * np.outer(scale_y, scale_y),
-        sample_time_s=sample_time_s,
-        input_delay=model.input_delay,
-    )
 
 
 def markov_of(controller: DiscreteController, count: int) -> FloatArray:

@@ -89,13 +89,17 @@ class InnovationModel:
             Complex gains, output unit per input unit, dead time included, hold not counted.
         """
         z = np.exp(1j * np.asarray(omega_rad_s, dtype=np.float64) * self.sample_time_s)
-        inner = self.C @ _resolvent(self.A, z) @ self.B + self.D
+        inner = self.C @ self.resolvent(omega_rad_s) @ self.B + self.D
         return np.asarray(inner * (z ** -float(self.input_delay))[:, None, None], dtype=np.complex128)
 
     def noise_response(self, omega_rad_s: FloatArray) -> ComplexArray:
         """Return H(exp(j omega Ts)), shape (W, n_y, n_y): the noise model, one at high frequency."""
+        return np.asarray(self.C @ self.resolvent(omega_rad_s) @ self.K + np.eye(len(self.C)), dtype=np.complex128)
+
+    def resolvent(self, omega_rad_s: FloatArray) -> ComplexArray:
+        """Return (z I - A)^-1 at z = exp(j omega Ts), shape (W, n, n)."""
         z = np.exp(1j * np.asarray(omega_rad_s, dtype=np.float64) * self.sample_time_s)
-        return np.asarray(self.C @ _resolvent(self.A, z) @ self.K + np.eye(self.C.shape[0]), dtype=np.complex128)
+        return np.asarray(np.linalg.inv(z[:, None, None] * np.eye(self.order) - self.A), dtype=np.complex128)
 
     def polynomials(self) -> tuple[FloatArray, FloatArray]:
         """Return numerator and denominator in ascending powers of the delay operator, denominator first term 1.
@@ -131,15 +135,30 @@ class InnovationModel:
             model = replace(model, A=A, B=B, C=C, D=np.zeros_like(model.D), K=K, input_delay=0)
         return model
 
+    def in_units(self, scale_u: FloatArray, scale_y: FloatArray, sample_time_s: float) -> InnovationModel:
+        """Return a model of scaled signals, u / scale_u and y / scale_y, in the signals' own units.
+
+        Parameters
+        ----------
+        scale_u, scale_y : (n_u,), (n_y,) arrays
+            What the signals were divided by.
+        sample_time_s : float
+            Sample time [s].
+        """
+        return replace(
+            self,
+            B=self.B / scale_u,
+            C=self.C * scale_y[:, None],
+            D=self.D * scale_y[:, None] / scale_u,
+            K=self.K / scale_y,
+            innovation_covariance=self.innovation_covariance * np.outer(scale_y, scale_y),
+            sample_time_s=sample_time_s,
+        )
+
 
 def spectral_radius(A: FloatArray) -> float:
     """Return the largest magnitude of the eigenvalues of A, 0 for an empty matrix."""
     return float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0))
-
-
-def _resolvent(A: FloatArray, z: ComplexArray) -> ComplexArray:
-    eye = np.eye(A.shape[0])
-    return np.asarray(np.linalg.inv(z[:, None, None] * eye - A), dtype=np.complex128)
 
 
 def from_polynomials(
