@@ -12,8 +12,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.config.procedure import OperatingPointSettings
 from autotune.errors import ExperimentStopped, LinkError
-from autotune.experiment.feasibility import highest_frequency_rad_s
-from autotune.experiment.loop import ControlLoop
+from autotune.experiment.loop import ControlLoop, Timing
 from autotune.experiment.monitor import RECENT
 from autotune.experiment.rig import Exchanges, RunsRelay
 from autotune.points import FrequencyPoint
@@ -24,6 +23,8 @@ SLOW_SHARE = 0.05
 #: least share of readings in preflight that differ from the one before, for a sensor of which that can be expected
 RESTLESS = 0.05
 SMALL = 1e-9
+#: samples per period that an estimate needs at least
+LEAST_SAMPLES = 8
 
 Tell = Callable[[str], None]
 
@@ -164,3 +165,35 @@ def _longest_run(y: FloatArray) -> int:
     """Return the length of the longest run of equal readings."""
     changes = np.flatnonzero(np.diff(y) != 0.0)
     return int(np.max(np.diff(np.concatenate([[-1], changes, [y.size - 1]]))))
+
+
+def highest_frequency_rad_s(timing: Timing, sample_time_s: float, gain_sd: float, *, exact: bool) -> float:
+    """Return the frequency up to which a point's error from the link stays within the wanted standard deviation.
+
+    Parameters
+    ----------
+    timing : Timing
+        Latencies seen so far.
+    sample_time_s : float
+        Control period [s].
+    gain_sd : float
+        Relative standard deviation that is wanted of a point, which is one of its phase as well [rad].
+    exact : bool
+        Whether rows carry the device's own stamps: then only the samples per period count.
+
+    Returns
+    -------
+    float
+        Angular frequency [rad/s].
+
+    Notes
+    -----
+    A command acts about one median latency later than its row says, which is a dead time in the phase; the latency's
+    scatter averages out over the samples of a period, of which the fewest are assumed.
+    """
+    by_samples = 2.0 * math.pi / (LEAST_SAMPLES * sample_time_s)
+    typical, late, _ = timing.latency_s
+    unknown_s = math.hypot(typical, (late - typical) / math.sqrt(LEAST_SAMPLES))
+    if exact or not unknown_s > 0.0:  # NaN where nothing was asked for
+        return by_samples
+    return min(by_samples, gain_sd / unknown_s)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from autotune.experiment.feasibility import highest_frequency_rad_s
 from autotune.experiment.loop import Timing
+from autotune.experiment.preflight import highest_frequency_rad_s
 from autotune.experiment.rig import Reading
 from autotune.experiment.run import run_experiment
 from drivers.simulated import SimulatedRig
