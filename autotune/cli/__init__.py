@@ -76,7 +76,6 @@ from autotune.cli import (  # noqa: E402, F401, I001
     rig,
     init,
     doctor,
-    files,
 )
 
 

@@ -1,4 +1,4 @@
-"""Command: a commented configuration from few questions, or from flags."""
+"""Commands on the configuration file: a commented one from few questions or from flags, and its schema."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 
 from autotune.cli import app
+from autotune.cli.common import OVERWRITE
 from autotune.cli.init_keys import REGISTER, Table, add_registers, set_keys
 from autotune.cli.init_model import EXAMPLE, ModelOfRig, model_of_rig
 from autotune.cli.init_questions import Questions, one_of
@@ -230,3 +231,16 @@ def _simulated_config(plant: Plant, told: Table) -> Table:
             case _, value:
                 known["signals"][name] = value
     return {"rig": {"kind": "simulated", "plant": plant, **known.pop("rig", {})}, **known}
+
+
+@app.command()
+def schema(
+    out: Annotated[Path, typer.Option(help="file to write the JSON Schema of the config to")],
+    overwrite: OVERWRITE = False,
+) -> None:
+    """Write the JSON Schema of the configuration, so that editors complete its keys."""
+    from autotune.config import json_schema
+
+    place = Output(out, overwrite=overwrite)
+    place.json(json_schema())
+    typer.echo(f"wrote {out}")
