@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,7 +20,9 @@ OUTSIDE = 0.05
 
 if TYPE_CHECKING:
     from autotune.arrays import FloatArray
+    from autotune.files import SignalNames
     from autotune.models import Model
+    from autotune.progress import Progress
     from autotune.recording import Recording
 
 
@@ -115,19 +119,14 @@ def diagnose(
 ) -> None:
     """Find where and why recordings differ from the simulation: numbers, missing physics, or something else."""
     if routine:
-        from autotune.cli.routine import look_at
-
-        look_at(recordings, out, {"--model": model, "--controller": controller, "--without": without},
-                signal_names(t, u, y, r), overwrite=overwrite)  # fmt: skip
+        unused = {"--model": model, "--controller": controller, "--without": without}
+        _look_at_routine(recordings, out, unused, signal_names(t, u, y, r), overwrite=overwrite)
         return
     if model is None:
         raise InputError(
             "no model", where="diagnose",
             remedy="give --model M.toml, or --routine for a loop in operation that has no model",
         )  # fmt: skip
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
     from autotune.controller import read_controller
     from autotune.diagnosis.diagnose import diagnose as find
     from autotune.equations.files import write_any
@@ -142,19 +141,8 @@ def diagnose(
     data = read_all(recordings, signal_names(t, u, y, r))
     require_units_of_model(nominal, data)
     law = None if controller is None else read_controller(controller)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    announce_compiling()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("diagnosing", total=1.0)
-        found = with_next_experiment(
-            find(
-                nominal,
-                data,
-                law,
-                without or (),
-                lambda what, share: progress.update(task, description=what, completed=share),
-            )
-        )
+    with _progress_shown("diagnosing") as progress:
+        found = with_next_experiment(find(nominal, data, law, without or (), progress))
     with place.write_all() as folder:
         found.write(folder / "diagnosis.json")
         write_any(found.extended_model, folder / "extended_model.toml", base=model.parent)
@@ -164,3 +152,40 @@ def diagnose(
     if found.description is not None:
         typer.echo(found.description.sentence)
     typer.echo(f"diagnosis.json, extended_model.toml and report.html are in {out}")
+
+
+def _look_at_routine(
+    recordings: Sequence[Path], out: Path, unused: Mapping[str, object], names: SignalNames, *, overwrite: bool
+) -> None:
+    """Look at recordings of one loop in operation, without a model, and write routine.json and the page."""
+    from autotune.diagnosis.routine import diagnose_routine
+    from autotune.report.routine_page import write_routine_page
+
+    given = next((option for option, value in unused.items() if value), None)
+    if given is not None:
+        raise InputError(
+            "it does not go with --routine, which fits a model of its own", where=given, remedy="leave one of them out"
+        )
+    place = OutputFolder(out, ("routine.json", "report.html"), inputs=tuple(recordings), overwrite=overwrite)
+    data = read_all(recordings, names)
+    with _progress_shown("looking") as progress:
+        found = diagnose_routine(data, progress=progress)
+    with place.write_all() as folder:
+        found.write(folder / "routine.json")
+        write_routine_page(found, folder / "report.html")
+    for sentence in (*found.sentences, found.following):
+        typer.echo(sentence)
+    typer.echo(f"routine.json and report.html are in {out}")
+
+
+@contextmanager
+def _progress_shown(begin: str) -> Iterator[Progress]:
+    """Show how far a search is, and yield what it tells that to."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    announce_compiling()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(begin, total=1.0)
+        yield lambda what, share: progress.update(task, description=what, completed=share)
