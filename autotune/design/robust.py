@@ -76,7 +76,7 @@ def design_on_points(points: Sequence[FrequencyPoint], specification: Specificat
         raise DesignError(f"{len(points)} points", where="points", remedy="a design on points needs at least three")
     of_low_order = consistent_structures(points)
     try:
-        plant = uncertain_plant(points)
+        plant = uncertain_plant(tuple(points))
     except DesignError:
         if not of_low_order.plants:
             raise

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -56,24 +55,15 @@ class UncertainPlant:
         )
 
 
-def uncertain_plant(points: Sequence[FrequencyPoint]) -> UncertainPlant:
-    """Return what the points say about the plant, between and beyond them.
-
-    Parameters
-    ----------
-    points : sequence of FrequencyPoint
-        At least three, with covariance.
+@lru_cache(maxsize=4)  # PI and PID, or two specifications, are often designed on the same points
+def uncertain_plant(points: tuple[FrequencyPoint, ...]) -> UncertainPlant:
+    """Return what the points, at least three with covariance, say about the plant, between and beyond them.
 
     Raises
     ------
     DesignError
         See :func:`autotune.design.process_class.consistent_processes`.
     """
-    return _uncertain_plant(tuple(points))
-
-
-@lru_cache(maxsize=4)  # PI and PID, or two specifications, are often designed on the same points
-def _uncertain_plant(points: tuple[FrequencyPoint, ...]) -> UncertainPlant:
     processes = consistent_processes(points)
     first, last = processes.omega_points[0], processes.omega_points[-1]
     inner = np.geomspace(0.7 * first, 1.5 * last, int(math.log(1.5 * last / (0.7 * first)) / 0.12) + 2)
