@@ -14,9 +14,9 @@ from functools import cached_property
 
 import numpy as np
 from scipy.fft import irfft
-from scipy.optimize import minimize
 
 from autotune.arrays import ComplexArray, FloatArray
+from autotune.design.simplex import search_by_simplex
 
 _PER_CROSSOVER = 0.08  # radians of the crossover per step of time
 _LEAST, _MOST = 1 << 10, 1 << 16
@@ -107,9 +107,7 @@ def least_error(load: LoadStep, slacks: Callable[[FloatArray], float], start: Fl
     size = int(np.sum(free))
     best, least = start, math.log(load.error(start))
 
-    def cost(x: FloatArray) -> float:
-        p = start.copy()
-        p[free] = start[free] * np.exp(x)
+    def cost(p: FloatArray) -> float:
         violated = min(slacks(p), 0.0)
         return math.log(max(load.error(p), 1e-300)) - _WALL * violated + (10.0 if violated <= -1.0 else 0.0)
 
@@ -117,19 +115,8 @@ def least_error(load: LoadStep, slacks: Callable[[FloatArray], float], start: Fl
     for span in _SPANS:
         for direction in (1.0, -1.0):
             at = np.log(best[free] / start[free]) + (inside if span == _SPANS[0] else 0.0)
-            result = minimize(
-                cost,
-                at,
-                method="Nelder-Mead",
-                options={
-                    "initial_simplex": np.vstack((at, at + direction * span * (np.eye(size) - 0.5 / size))),
-                    "xatol": 1e-3,
-                    "fatol": 1e-5,
-                    "maxiter": 60 * size,
-                },
-            )
-            p = start.copy()
-            p[free] = start[free] * np.exp(result.x)
+            vertices = np.vstack((at, at + direction * span * (np.eye(size) - 0.5 / size)))
+            p = search_by_simplex(cost, start, vertices, xatol=1e-3, fatol=1e-5, maxiter=60 * size)[0]
             if slacks(p) >= 0.0 and math.log(load.error(p)) < least:
                 best, least = p, math.log(load.error(p))
     return best

@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.optimize import minimize
 
-from autotune.arrays import BoolArray, ComplexArray, FloatArray
+from autotune.arrays import ComplexArray, FloatArray
 from autotune.controller import PIDController
 from autotune.design.corners import plainest
 from autotune.design.figures import columns
@@ -25,6 +24,7 @@ from autotune.design.members import members_of
 from autotune.design.on_fit import ROUNDS, most_missed
 from autotune.design.on_structures import design_on_structures, require_kept
 from autotune.design.search import minimise
+from autotune.design.simplex import search_by_simplex
 from autotune.design.specification import PROBABILITY, UNCERTAIN, Design, Kind, Specification
 from autotune.design.uncertain import UncertainPlant, guaranteed_figures, uncertain_plant
 from autotune.errors import DesignError
@@ -187,24 +187,14 @@ def _raise_least_slack(plant: UncertainPlant, specification: Specification, node
     looked = nodes[:: max(1, len(nodes) // _LOOKED)]
     least = np.array([np.min(_slacks(plant, specification, node)) for node in looked])
     for node in looked[np.argsort(-least)][:_LED]:
-        free = node > 0.0
-        size = int(np.sum(free))
 
-        def missed(x: FloatArray, node: FloatArray = node, free: BoolArray = free) -> float:
-            p = node.copy()
-            p[free] = node[free] * np.exp(x)
+        def missed(p: FloatArray) -> float:
             return -min(float(np.min(_slacks(plant, specification, p))), _INSIDE)
 
-        simplex = 0.3 * (np.vstack((np.zeros(size), np.eye(size))) - 0.5 / size)
-        result = minimize(
-            missed,
-            np.zeros(size),
-            method="Nelder-Mead",
-            options={"initial_simplex": simplex, "maxfev": 120 * size},
-        )
-        if result.fun <= 0.0:
-            reached = node.copy()
-            reached[free] = node[free] * np.exp(result.x)
+        size = int(np.sum(node > 0.0))
+        vertices = 0.3 * (np.vstack((np.zeros(size), np.eye(size))) - 0.5 / size)
+        reached, least_missed = search_by_simplex(missed, node, vertices, maxfev=120 * size)
+        if least_missed <= 0.0:
             return [reached]
     return []
 
@@ -220,25 +210,14 @@ def _inwards(plant: UncertainPlant, specification: Specification, p: FloatArray)
 
 def _simplex(plant: UncertainPlant, specification: Specification, start: FloatArray, span: float) -> FloatArray:
     """Return the controller that a simplex of size ``span`` with a steep wall at the constraints comes to."""
-    free = start > 0.0
-    size = int(np.sum(free))
 
-    def cost(x: FloatArray) -> float:
-        p = start.copy()
-        p[free] = start[free] * np.exp(x)
+    def cost(p: FloatArray) -> float:
         violated = np.minimum(_slacks(plant, specification, p), 0.0)
         return _norm(plant, p) - _WALL * float(np.min(violated))
 
-    simplex = np.vstack((np.zeros(size), span * (np.eye(size) - 0.5 / size)))
-    result = minimize(
-        cost,
-        np.zeros(size),
-        method="Nelder-Mead",
-        options={"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-6, "maxiter": 200 * size},
-    )
-    moved = start.copy()
-    moved[free] = start[free] * np.exp(result.x)
-    return moved
+    size = int(np.sum(start > 0.0))
+    vertices = np.vstack((np.zeros(size), span * (np.eye(size) - 0.5 / size)))
+    return search_by_simplex(cost, start, vertices, xatol=1e-4, fatol=1e-6, maxiter=200 * size)[0]
 
 
 def _quadratic(

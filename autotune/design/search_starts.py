@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import minimize
 
-from autotune.arrays import BoolArray, FloatArray
+from autotune.arrays import FloatArray
 from autotune.design.search import Problem
+from autotune.design.simplex import search_by_simplex
 
 _ENOUGH = 0.01  # slack with which a controller counts as well inside
 
@@ -23,24 +23,14 @@ def admissible(problem: Problem, starts: FloatArray) -> FloatArray:
     """
     found = []
     for start in starts:
-        free = start > 0.0
 
-        def missed(x: FloatArray, start: FloatArray = start, free: BoolArray = free) -> float:
-            p = start.copy()
-            p[free] = start[free] * np.exp(x)
+        def missed(p: FloatArray) -> float:
             return -min(float(np.min(problem.norms_and_slacks(p[None, :], thin=2)[1])), _ENOUGH)
 
-        size = int(np.sum(free))
-        simplex = 0.4 * (np.vstack((np.zeros(size), np.eye(size))) - 0.5 / size)
-        result = minimize(
-            missed,
-            np.zeros(size),
-            method="Nelder-Mead",
-            options={"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-5, "maxfev": 150 * size},
-        )
-        if result.fun <= 0.0:
-            reached = start.copy()
-            reached[free] = start[free] * np.exp(result.x)
+        size = int(np.sum(start > 0.0))
+        vertices = 0.4 * (np.vstack((np.zeros(size), np.eye(size))) - 0.5 / size)
+        reached, least = search_by_simplex(missed, start, vertices, xatol=1e-4, fatol=1e-5, maxfev=150 * size)
+        if least <= 0.0:
             found.append(reached)
     return np.array(found).reshape(-1, 4)
 
