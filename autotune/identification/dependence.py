@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import log_ndtr, ndtr
 
 from autotune.arrays import FloatArray, is_constant
-from autotune.distributions import log_normal_tail, normal_tail
 from autotune.errors import IdentificationError
 from autotune.recording import Recording
 
@@ -385,11 +385,11 @@ def _closest(cause: FloatArray, effect: FloatArray, first: int) -> tuple[float, 
         left = energy[n - lags]
         scale = np.where(left > _LEAST_ENERGY * energy[n], sd * np.sqrt(left), math.inf)
         looks = each * np.maximum(1.0, lags / width)
-        chance = np.log(looks) + log_normal_tail(np.abs(products) / scale)
+        chance = np.log(looks) + log_ndtr(-np.abs(products) / scale)
         at = int(np.argmin(chance))
         pairs = sums[: n - lags[at]] * effect[lags[at] :] * np.sign(products[at])
         size = float(np.sum(pairs) - np.max(pairs)) / float(scale[at])
-        found = float(min(1.0, 2.0 * normal_tail(size) * looks[at]))
+        found = float(min(1.0, 2.0 * ndtr(-size) * looks[at]))
         if found < best:
             best, lag, sign = found, int(lags[at]), 1 if products[at] > 0.0 else -1
             within = lag + int(width)

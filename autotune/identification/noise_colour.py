@@ -22,9 +22,10 @@ from functools import lru_cache
 import numpy as np
 from numba import njit
 from scipy.optimize import minimize
+from scipy.special import fdtri, ndtri, stdtrit
 
 from autotune.arrays import FloatArray
-from autotune.distributions import chi2_quantile, f_quantile, normal_quantile, student_quantile
+from autotune.distributions import chi2_quantile
 
 WHITE = np.empty(0)
 MAX_AR = 12
@@ -65,13 +66,13 @@ class NoiseColour:
 
     def widening(self) -> FloatArray:
         """Return, for each parameter, by how much 1.96 standard deviations fall short of Student's 95 % interval."""
-        return student_quantile(0.975, self.freedom) / normal_quantile(0.975)
+        return np.asarray(stdtrit(self.freedom, 0.975) / ndtri(0.975), dtype=np.float64)
 
 
 @lru_cache
 def region_widening(freedom: float) -> float:
     """Return the factor on a plane's covariance with which its 95 % region of known variance is that of Hotelling."""
-    return 2.0 * f_quantile(0.95, 2, freedom) / chi2_quantile(0.95, 2)
+    return 2.0 * float(fdtri(2, freedom, 0.95)) / chi2_quantile(0.95, 2)
 
 
 def whitening_filter(residual: FloatArray, max_order: int = MAX_AR) -> FloatArray:

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy.special import fdtrc
 
 from autotune.arrays import FloatArray
-from autotune.distributions import f_tail
 from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.output_error import residuals
 from autotune.identification.delay.response import sensitivities
@@ -121,7 +121,7 @@ def judge_equation(
     variance = (float(gram[-1, -1]) - by_all) / freedom
     each = [explain(kind) for kind in range(len(TESTS))]
     ratios = [(squares - by_model) / max(more - rank, 1) / variance for squares, more in each]
-    p = [f_tail(ratio, max(more - rank, 1), freedom) for ratio, (_, more) in zip(ratios, each, strict=True)]
+    p = [float(fdtrc(max(more - rank, 1), freedom, ratio)) for ratio, (_, more) in zip(ratios, each, strict=True)]
     return (p[0], p[1], p[2]), max(1.0, ratios[0])
 
 

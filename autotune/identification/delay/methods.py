@@ -6,9 +6,9 @@ import contextlib
 from collections.abc import Callable, Iterator
 
 import numpy as np
+from scipy.special import ndtri, stdtrit
 
 from autotune.arrays import FloatArray
-from autotune.distributions import normal_quantile, student_quantile
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay.data import DelayData, prepare
 from autotune.identification.delay.model import DelayModel
@@ -196,7 +196,7 @@ def _noise_like(residual: FloatArray, whitening: FloatArray, rows: int) -> Itera
 
 def _spread(draws: FloatArray) -> FloatArray:
     """Return the covariance of estimates, larger by what few draws leave open: 1.96 sd are a 95 % interval."""
-    open_left = (student_quantile(0.975, len(draws) - 1) / normal_quantile(0.975)) ** 2
+    open_left = float(stdtrit(len(draws) - 1, 0.975) / ndtri(0.975)) ** 2
     return np.asarray(np.cov(draws.T) * open_left)
 
 

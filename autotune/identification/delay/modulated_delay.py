@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
+from scipy.special import fdtri
 
 from autotune.arrays import BoolArray
-from autotune.distributions import f_quantile
 from autotune.errors import InputError
 from autotune.identification.delay.modulated_integrals import Interval, Modulated, modulated_by_fourier_sums
 from autotune.recording import Recording
@@ -126,7 +126,7 @@ def modulated_delay(recording: Recording, order: int, intervals: Sequence[Interv
         own = within(h) - unknowns
         if own <= 0:  # explained whatever the delay is: none of them is told from another
             return np.inf if within(0.0) == unknowns else 0.0
-        shares = (f_quantile(1.0 - _BY_CHANCE, own, n) * residual for n, residual in others if n > 0)
+        shares = (float(fdtri(own, n, 1.0 - _BY_CHANCE)) * residual for n, residual in others if n > 0)
         return float(min(shares, default=0.0)) + _EXACT
 
     estimates: list[ModulatedDelay] = []
