@@ -14,8 +14,8 @@ from autotune.errors import InputError
 from autotune.whole_files import write_whole
 
 if TYPE_CHECKING:
+    from autotune.report.page import Table as PageTable
     from sim.proof import Campaign
-    from sim.score import Mark, Row
 
 
 def publish(path: Path, digest: str) -> None:
@@ -68,39 +68,19 @@ def _diagnose(task: tuple[Campaign, int]) -> None:
     diagnose(*task)
 
 
-def print_confusion(console: Console, marks: Sequence[Mark]) -> None:
-    """Print what was said of what.
+def print_table(console: Console, title: str, table: PageTable) -> None:
+    """Print a table of the page of the proof.
 
     Parameters
     ----------
     console : Console
         Where.
-    marks : sequence of Mark
-        One for each case.
+    title : str
+        Above it.
+    table : Table
+        As the page shows it.
     """
-    from sim.score import confusion
-
-    view = Table("concealed", "cases", "right", "said instead", title="Confusion matrix, by rows")
-    for name, count, right, said in confusion(marks):
-        view.add_row(name, str(count), str(right), ", ".join(f"{word} {times}" for word, times in said))
-    console.print(view)
-
-
-def print_table(console: Console, rows: Sequence[Row]) -> None:
-    """Print the figures with what is asked of them.
-
-    Parameters
-    ----------
-    console : Console
-        Where.
-    rows : sequence of Row
-        One for each figure.
-    """
-    view = Table("figure", "asked", "measured", "95 % interval", "of", "met", title="Proof on concealed cases")
-    for row in rows:
-        share = row.interval is not None
-        value = f"{100 * row.value:.1f} %" if share else f"{row.value:.3f}"
-        interval = f"{100 * row.interval[0]:.1f} to {100 * row.interval[1]:.1f} %" if row.interval else ""
-        met = "" if row.met is None else ("yes" if row.met else "no")
-        view.add_row(row.figure, row.asked, value if row.count else "-", interval, str(row.count), met)
+    view = Table(*table.header, title=title)
+    for row in table.rows:
+        view.add_row(*map(str, row))
     console.print(view)

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from autotune.cli import app
-from autotune.cli.proof_steps import diagnose_all, print_confusion, print_table, publish
+from autotune.cli.proof_steps import diagnose_all, print_table, publish
 from autotune.cli.prove_recorded import prove_recorded
 from autotune.errors import InputError, require_extra
 from autotune.whole_files import write_whole
@@ -76,8 +76,9 @@ def _prove_simulated(
     """Prove on simulated recordings; ``ablation`` is the entry left out and the most cases of it."""
     from rich.progress import track
 
+    from autotune.report.proof_page import confusion_table, figures_table
     from sim.proof import Campaign, conceal, keep_failures, mark_all, seal
-    from sim.score import resolved, table
+    from sim.score import confusion, resolved, table
 
     campaign = Campaign(out=out, seeds=seeds, tool=(sys.executable, "-m", "autotune.cli"))
     console = Console(highlight=False)
@@ -94,18 +95,19 @@ def _prove_simulated(
     if seal(campaign) != digest:
         raise InputError(f"{out / 'sealed'}: an answer changed while the cases were diagnosed; start a fresh campaign")
     marks = mark_all(campaign, list(seeds))
-    rows = [*table(marks), resolved([one["resolved"] for one in tried if one["experiment"]])]
+    of_ties = resolved([one["resolved"] for one in tried if one["experiment"]])
+    figures = [asdict(row) for row in (*table(marks), of_ties)]
     result = {
         "seed": seeds[0],
         "cases": len(seeds),
         "sha256": digest,
-        "table": [asdict(row) for row in rows],
+        "table": figures,
         "marks": [asdict(m) for m in marks],
         "ties": tried,
     }
     write_whole(out / "proof.json", json.dumps(result, indent=1))
-    print_confusion(console, marks)
-    print_table(console, rows)
+    print_table(console, "Confusion matrix, by rows", confusion_table(confusion(marks)))
+    print_table(console, "Proof on concealed cases", figures_table(figures))
     failures = keep_failures(campaign, marks)
     _write_page(campaign, result, marks)
     console.print(f"report: {out / 'report.html'}", markup=False)

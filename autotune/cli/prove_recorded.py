@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from autotune.cli.proof_steps import diagnose_all, print_confusion, print_table, publish
+from autotune.cli.proof_steps import diagnose_all, print_table, publish
 from autotune.errors import InputError
 from autotune.whole_files import write_whole
 
@@ -74,28 +74,30 @@ def prove_recorded(folder: Path, out: Path, cases: int | None, seed: int, worker
 
 def _reveal(console: Console, campaign: RecordedCampaign, marks: Sequence[RecordedMark], digest: str) -> None:
     """Print the tables and write ``proof.json``, ``failures.txt`` and the page."""
+    from autotune.report.proof_page import confusion_table, figures_table
     from sim.proof import keep_failures
     from sim.recorded.campaign import as_json
     from sim.recorded.score import by_rig, table
+    from sim.score import confusion
 
-    rows = table(marks)
+    figures = [asdict(row) for row in table(marks)]
     counted = [m.mark for m in marks if not m.not_counted]
     result = {
         "seed": campaign.cases.seeds[0],
         "cases": len(counted),
         "sha256": digest,
-        "table": [asdict(row) for row in rows],
+        "table": figures,
         **as_json(campaign, marks),
     }
     out = campaign.cases.out
     write_whole(out / "proof.json", json.dumps(result, indent=1))
-    print_confusion(console, counted)
+    print_table(console, "Confusion matrix, by rows", confusion_table(confusion(counted)))
     rigs = by_rig(marks)
     for name, count, right, wrong, missed in rigs:
         console.print(f"{name}: {right} of {count} right, {wrong} wrong new names", markup=False)
         for line in missed:
             console.print(f"    {line}", markup=False)
-    print_table(console, rows)
+    print_table(console, "Proof on concealed cases", figures_table(figures))
     failures = keep_failures(campaign.cases, counted)
     _write_page(out, result, counted, rigs)
     console.print(f"report: {out / 'report.html'}", markup=False)

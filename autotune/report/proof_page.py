@@ -64,16 +64,17 @@ def proof_page(
             ("What to do", todo),
         ),
         sections=(
-            Section(title="Figures", tables=(_figures(rows),)),
+            Section(title="Figures", tables=(figures_table(rows),)),
             *further,
             *_calibration(result["marks"], interval),
             Section(title=f"Missed cases ({len(missed)})", tables=(_missed_cases_table(missed),) if missed else ()),
-            Section(title="What was said of what", tables=(_confusion(confusion),)),
+            Section(title="What was said of what", tables=(confusion_table(confusion),)),
         ),
     )
 
 
-def _figures(rows: Sequence[Content]) -> Table:
+def figures_table(rows: Sequence[Content]) -> Table:
+    """Return the figures with what is asked of them."""
     cells = []
     for row in rows:
         share = row["interval"] is not None
@@ -140,7 +141,8 @@ def _missed_cases_table(missed: Sequence[Content]) -> Table:
     return Table(header=header, rows=rows, caption="Each lies in its folder with model, recordings and diagnosis.")
 
 
-def _confusion(confusion: Sequence[tuple[Any, ...]]) -> Table:
+def confusion_table(confusion: Sequence[tuple[Any, ...]]) -> Table:
+    """Return what was said of what."""
     rows = tuple(
         (str(name), str(count), str(right), ", ".join(f"{word} {times}" for word, times in said))
         for name, count, right, said in confusion
