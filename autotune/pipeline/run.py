@@ -162,10 +162,9 @@ def _tune(
             analysis = on_registers(analysis, held)
         reduced = None if analysis.reduced is None else analysis.reduced.transfer_function()
         log.say_analysis(analysis.points, analysis.fit.plant, reduced, analysis.controller)
-        handed = _hand_over(
+        verification, old, deployed = _hand_over(
             rig, config, analysis, experiment, out, log, verify=verify, deploy=deploy, on_status=on_status
         )
-        verification, old, deployed = handed.verification, handed.old, handed.deployed
         audit = audit_log(config, out, "run")
         log.gains(old, analysis.controller, deployed=deployed)
         if isinstance(rig, HoldsGains) and old is not None and deployed and keep is not None:
@@ -199,15 +198,6 @@ def _write_completed(tuning: Tuning, out: Path) -> None:
         ) from None
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Handed:
-    """What became of the new controller at the rig."""
-
-    verification: Verification | None = None
-    old: PIDController | None = None
-    deployed: bool = False
-
-
 def _hand_over(
     rig: Rig,
     config: Config,
@@ -219,8 +209,11 @@ def _hand_over(
     verify: bool,
     deploy: bool,
     on_status: OnStatus,
-) -> _Handed:
-    """Verify the controller and hand it over; where the rig's own law can be tried it is what is verified."""
+) -> tuple[Verification | None, PIDController | None, bool]:
+    """Verify the controller and hand it over; where the rig's own law can be tried it is what is verified.
+
+    Returned are the verification, the gains that the rig held before, and whether it holds the new ones.
+    """
     audit = audit_log(config, out, "run")
 
     def verified(controller: PIDController, gains: TrialGains | None = None) -> Verification:
@@ -248,14 +241,14 @@ def _hand_over(
             try_out=verified,
             audit=audit,
         )
-        return _Handed(verification=done.verification, old=done.old, deployed=done.kept)
+        return done.verification, done.old, done.kept
     verification = verified(analysis.controller) if verify else None
     accepted = verification is not None and verification.accepted
     if not isinstance(rig, HoldsGains):
-        return _Handed(verification=verification)
+        return verification, None, False
     said = f"{verification.whose}; {verification.reason}" if verification is not None else ""
     old = hand_over(rig, analysis.controller if accepted and deploy else None, out / JOURNAL, audit=audit, why=said)
-    return _Handed(verification=verification, old=old, deployed=accepted and deploy)
+    return verification, old, accepted and deploy
 
 
 def _teller(on_status: OnStatus, elapsed_s: float) -> Callable[[str], None]:
