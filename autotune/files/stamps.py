@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import functools
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from autotune.errors import InputError
 from autotune.files.cells import NUMBER, Cells, numbers
 
 _DAY_S = 86400.0
+_EPOCH = datetime.date(1970, 1, 1).toordinal()
 #: Months by the first three letters of their name, in English, German and French.
 _MONTHS = {
     **dict.fromkeys(("jan",), 1), **dict.fromkeys(("feb", "fév"), 2), **dict.fromkeys(("mar", "mär", "mrz"), 3),
@@ -255,12 +255,7 @@ def _day_seconds(year: str | None, month: str | None, name: str | None, day: str
         return 0.0
     number = int(year) + (0 if len(year) > 2 else 2000 if int(year) < 70 else 1900)
     which = int(month) if month is not None else _MONTHS[str(name).lower()[:3]]
-    return _DAY_S * (datetime.date(number, which, int(day)).toordinal() - _epoch())
-
-
-@functools.cache
-def _epoch() -> int:
-    return datetime.date(1970, 1, 1).toordinal()
+    return _DAY_S * (datetime.date(number, which, int(day)).toordinal() - _EPOCH)
 
 
 def _zone_seconds(zone: str | None) -> float:

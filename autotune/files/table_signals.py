@@ -15,16 +15,8 @@ from autotune.files.stamps import StampForm, detect_form, form_of_strptime, seco
 from autotune.files.table import FileForm, Table, list_names
 
 _MOST_OTHERS = 8
-_FLAG_NAMES = (
-    "{tag}.q",
-    "{tag}_q",
-    "{tag}.quality",
-    "{tag}_quality",
-    "{tag} quality",
-    "{tag}.status",
-    "{tag} status",
-    "{tag}_status",
-)
+#: what the name of a column of quality has behind that of its signal
+_FLAG_ENDS = (".q", "_q", ".quality", "_quality", " quality", ".status", " status", "_status")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,7 +89,7 @@ def _flag_of(table: Table, name: str, pattern: str | None) -> str:
         flag = pattern.replace("{tag}", name)
         return flag if flag in table.names else ""
     by_name = {other.lower(): other for other in table.names}
-    found = (by_name.get(pattern.replace("{tag}", table.bare(name).lower()), "") for pattern in _FLAG_NAMES)
+    found = (by_name.get(table.bare(name).lower() + end, "") for end in _FLAG_ENDS)
     return next((flag for flag in found if flag and are_flags(table.sample[flag])), "")
 
 
