@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from autotune.arrays import ComplexArray, FloatArray
+from autotune.identification.envelope import polar_sd
 from autotune.points import FrequencyPoint
 from autotune.recording import Recording
 from autotune.report import chart as go
@@ -241,13 +242,8 @@ def gain_phase(response: ComplexArray) -> tuple[FloatArray, FloatArray]:
 
 def gain_phase_bars(point: FrequencyPoint) -> tuple[float, float]:
     """Return the half-lengths of the 95 % bars of gain and phase [rad], from the covariance along and across."""
-    along = np.array([point.response.real, point.response.imag]) / point.gain
-    across = np.array([-along[1], along[0]])
-    covariance = np.array(point.covariance)
-    return (
-        1.96 * float(np.sqrt(along @ covariance @ along)),
-        1.96 * float(np.sqrt(across @ covariance @ across)) / point.gain,
-    )
+    gain_sd, phase_sd = polar_sd(point)
+    return 1.96 * gain_sd * point.gain, 1.96 * phase_sd
 
 
 def region(point: FrequencyPoint, factor: complex) -> ComplexArray:
