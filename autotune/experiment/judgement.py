@@ -179,18 +179,13 @@ class Expectation:
     allowed : float
         Largest rms error that prediction and noise explain [y unit].
     vacuous : str
-        Why that error would be no evidence; empty where it is.
+        Why that error would be no evidence, as nearly any loop keeps it; empty where it is.
     """
 
     prediction: Prediction
     responses: tuple[FloatArray, ...]
     allowed: float
     vacuous: str
-
-    @property
-    def is_vacuous(self) -> bool:
-        """Whether nearly any loop would be accepted."""
-        return bool(self.vacuous)
 
 
 def expectation(
@@ -267,7 +262,7 @@ def judge(
     usable = np.isfinite(y)
     measured = smooth_steps(np.where(usable, y, np.interp(test.t, test.t[usable], y[usable])), test)
     rms_error = _rms(measured - smooth_steps(expected.prediction.y, test))
-    accepted = rms_error <= expected.allowed and not expected.is_vacuous
+    accepted = rms_error <= expected.allowed and not expected.vacuous
     misread = running_law is not None and bool(running_law.misreading)
     drawn = [_figures(test, response) for response in expected.responses]
     reason = _reason(test, expected, rms_error, accepted)
@@ -295,7 +290,7 @@ def judge(
 
 def _reason(test: StepTest, expected: Expectation, rms_error: float, accepted: bool) -> str:
     error, limit = (f"{value:.3g} {test.y_unit}".strip() for value in (rms_error, expected.allowed))
-    if expected.is_vacuous:
+    if expected.vacuous:
         return f"nothing is verified: {expected.vacuous}; {REMEDY}"
     if accepted:
         return f"the loop behaves as predicted: rms error {error}, up to {limit} is explained"

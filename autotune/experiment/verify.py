@@ -237,7 +237,7 @@ def _scan(rig: RunsOwnController, sample_time_s: float) -> float:
 
 def _require_telling(expected: Expectation) -> None:
     """Refuse a test that nearly any loop would pass, before the rig is touched."""
-    if expected.is_vacuous:
+    if expected.vacuous:
         raise DesignError(
             f"nothing could be verified: {expected.vacuous}",
             where="verification",
