@@ -45,31 +45,31 @@ from typing import TYPE_CHECKING, Any  # noqa: E402
 from autotune.version import __version__ as __version__  # noqa: E402
 
 if TYPE_CHECKING:
-    from autotune.api.control_systems import to_control
-    from autotune.api.diagnosing import diagnose, simulate
-    from autotune.api.examples import example
-    from autotune.api.methods import (
-        closed_loop,
-        delay,
-        margins,
-        reduce,
-        transition,
-        tune,
-        validate,
-    )
-    from autotune.api.models import Model
-    from autotune.api.plots import plot
-    from autotune.api.points import Points, frequency_points
-    from autotune.api.pole_placement import rst
-    from autotune.api.python_control import from_control
-    from autotune.api.recordings import read
-    from autotune.api.shown import to_pandas
-    from autotune.controller import PIDController as PI  # noqa: N814 - as people write it
-    from autotune.controller import read_controller
-    from autotune.identification.delay.online_modulating import OnlineEstimator
-    from autotune.model_tables import read_model
-    from autotune.models import TransferFunction
-    from autotune.recording import Recording
+    from autotune.api.control_systems import to_control as to_control
+    from autotune.api.diagnosing import diagnose as diagnose
+    from autotune.api.diagnosing import simulate as simulate
+    from autotune.api.examples import example as example
+    from autotune.api.methods import closed_loop as closed_loop
+    from autotune.api.methods import delay as delay
+    from autotune.api.methods import margins as margins
+    from autotune.api.methods import reduce as reduce
+    from autotune.api.methods import transition as transition
+    from autotune.api.methods import tune as tune
+    from autotune.api.methods import validate as validate
+    from autotune.api.models import Model as Model
+    from autotune.api.plots import plot as plot
+    from autotune.api.points import Points as Points
+    from autotune.api.points import frequency_points as frequency_points
+    from autotune.api.pole_placement import rst as rst
+    from autotune.api.python_control import from_control as from_control
+    from autotune.api.recordings import read as read
+    from autotune.api.shown import to_pandas as to_pandas
+    from autotune.controller import PIDController as PI  # noqa: F401, N814 - as people write it
+    from autotune.controller import read_controller as read_controller
+    from autotune.identification.delay.online_modulating import OnlineEstimator as OnlineEstimator
+    from autotune.model_tables import read_model as read_model
+    from autotune.models import TransferFunction as TransferFunction
+    from autotune.recording import Recording as Recording
 
 #: name -> module and name there
 _HOMES = {
@@ -100,33 +100,7 @@ _HOMES = {
     "read_controller": "autotune.controller",
 }
 
-__all__ = [
-    "PI",
-    "Model",
-    "OnlineEstimator",
-    "Points",
-    "Recording",
-    "TransferFunction",
-    "closed_loop",
-    "delay",
-    "diagnose",
-    "example",
-    "frequency_points",
-    "from_control",
-    "margins",
-    "plot",
-    "read",
-    "read_controller",
-    "read_model",
-    "reduce",
-    "rst",
-    "simulate",
-    "to_control",
-    "to_pandas",
-    "transition",
-    "tune",
-    "validate",
-]
+__all__ = [*_HOMES]
 
 
 def __getattr__(name: str) -> Any:

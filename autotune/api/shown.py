@@ -187,14 +187,6 @@ def _(result: Model) -> tuple[str, Row, list[Row]]:
     return f"Model {result.name}", ("block", "place", "num", "den", "delay [s]"), [*rows]
 
 
-#: What shows itself in a notebook.
-SHOWN: tuple[type, ...] = (
-    Recording, Points, ReducedModel, Margins, PIDController, Design, Validation, DelayModel, TwoDelays, InnovationModel,
-    ClosedLoopIdentification, TransferFunction, DiscreteController, Trajectory, Model,
-    RST,
-)  # fmt: skip
-
-
 def html(result: Any) -> str:
     """Return a result's table for a notebook."""
     title, header, rows = rows_of(result)
@@ -326,7 +318,7 @@ def to_pandas(result: Any) -> Any:
     return frame
 
 
-for _shown in SHOWN:
+for _shown in rows_of.registry.keys() - {object}:
     setattr(_shown, "_repr_html_", html)  # noqa: B010 - the rooms below know nothing of notebooks
 # printed as it is, it would be all matrices and residuals of every structure that was tried
 setattr(ClosedLoopIdentification, "__str__", text)  # noqa: B010 - see above
