@@ -69,7 +69,7 @@ def sweep(
     ends = _ends_deg(wanted, earlier)
     if not earlier.segments:
         ends = within_reach(ends, known.points[0], known.plant_sign)
-    targets = list(_missing(ends, wanted, earlier))
+    targets = _missing(ends, wanted, earlier)
     end_s = known.first_move_s + wanted.budget_s - earlier.swept_s
     run = SweepRun(loop=loop, y_centre=point.y, wanted=wanted, oscillation=oscillation, show=show, earlier=earlier)
     loop.note(first_move_s=known.first_move_s, phases_deg=list(ends))
@@ -200,12 +200,7 @@ def missing_phases(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float,
     """
     if is_together(earlier):
         return ()
-    return _missing(_ends_deg(wanted, earlier), wanted, earlier)
-
-
-def _phases_between(ends_deg: Sequence[float], wanted: ExperimentSettings, segments: Sequence[Segment]) -> list[float]:
-    """Return the wanted phases of a range [deg] that no limit cycle aimed at [rad]."""
-    return [phase for phase in phase_targets(ends_deg[0], ends_deg[1], wanted.points) if not is_aimed(phase, segments)]
+    return tuple(_missing(_ends_deg(wanted, earlier), wanted, earlier))
 
 
 def _ends_deg(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, float]:
@@ -215,5 +210,6 @@ def _ends_deg(wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, floa
     return float(first), float(last)
 
 
-def _missing(ends_deg: tuple[float, float], wanted: ExperimentSettings, earlier: Earlier) -> tuple[float, ...]:
-    return tuple(_phases_between(ends_deg, wanted, earlier.segments))
+def _missing(ends_deg: tuple[float, float], wanted: ExperimentSettings, earlier: Earlier) -> list[float]:
+    """Return the wanted phases of a range [deg] that no limit cycle aimed at [rad]."""
+    return [phase for phase in phase_targets(*ends_deg, wanted.points) if not is_aimed(phase, earlier.segments)]
