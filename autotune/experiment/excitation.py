@@ -20,7 +20,7 @@ from autotune.design.law import LawState, PILaw
 from autotune.experiment.approach import approach, find_midpoint
 from autotune.experiment.limits import Watch
 from autotune.experiment.loop import ControlLoop, Tick
-from autotune.experiment.preflight import preflight
+from autotune.experiment.preflight import preflight, silent
 from autotune.experiment.result import State, Status
 from autotune.experiment.rig import Rig
 from autotune.experiment.run import OnStatus, envelope_of, recording_metadata, wait_for_rest
@@ -175,10 +175,6 @@ def run_excitation(
 
 def _brought_there(loop: ControlLoop, config: Config) -> float:
     """Bring the plant to its operating point, slowly moving, and return the command that is believed to hold it."""
-
-    def silent(_: str) -> None:
-        return
-
     point, wanted = config.operating_point, config.experiment
     if point.approach == "ramp":
         wait_for_rest(loop)

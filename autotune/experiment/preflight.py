@@ -29,6 +29,10 @@ LEAST_SAMPLES = 8
 Tell = Callable[[str], None]
 
 
+def silent(_: str) -> None:
+    """Tell nobody."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Known:
     """What the procedure has learnt so far.

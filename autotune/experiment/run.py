@@ -17,7 +17,7 @@ from autotune.experiment.cycles import Earlier, noise_of, refine_cycles
 from autotune.experiment.device import DeviceOscillation
 from autotune.experiment.limits import Envelope, Watch
 from autotune.experiment.loop import ControlLoop, Timing
-from autotune.experiment.preflight import Known, preflight
+from autotune.experiment.preflight import Known, preflight, silent
 from autotune.experiment.relay import RelaySettings
 from autotune.experiment.result import ExperimentResult, Part, Segment, State, Status
 from autotune.experiment.return_to_setpoint import return_by_relay, setpoint_before
@@ -241,10 +241,6 @@ def bring_to_operating_point(
     Known
         What was learnt; the plant is near its operating point, and the caller's law takes it from the next sample.
     """
-
-    def silent(_: str) -> None:
-        return
-
     point, wanted = config.operating_point, config.experiment
     known = preflight(loop, point, wanted.gain_sd, silent)
     if plant_sign and u_rest is not None:
