@@ -169,7 +169,6 @@ def write(tie: Tie, folder: Path) -> None:
     """
     random = np.random.default_rng((tie.seed, 2))
     gain, tau = GAIN * random.uniform(0.85, 1.15), TAU * random.uniform(0.85, 1.15)
-    folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "model.toml", MODEL.format(gain=gain, tau=tau))
     write_text(folder / "config.toml", CONFIG)
     plant = Servo(tie.left_out, tie.size, tie.seed + 2)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text as UTF-8 beside its place and move it there; one that is there is replaced.
+    """Write a text as UTF-8 beside its place and move it there, folder included; one that is there is replaced.
 
     Parameters
     ----------
@@ -16,6 +16,7 @@ def write_text(path: Path, text: str) -> None:
     text : str
         What it holds.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".part-{path.name}")
     part.write_text(text, encoding="utf-8")
     os.replace(part, path)

@@ -175,7 +175,6 @@ def write(seed: int, folder: Path, answer_file: Path) -> dict[str, Any]:
         For the answer, elsewhere.
     """
     d, records, answer = make(seed)
-    folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "model.toml", model_file(d.rig))
     digits = 1 if d.rig.rig == PROCESS else 3
     for name, ex, r in zip(FILES, d.excitations, records, strict=True):
@@ -188,6 +187,5 @@ def write(seed: int, folder: Path, answer_file: Path) -> dict[str, Any]:
         units = f'[units]\nt = "s"\nu = "{d.rig.unit_u}"\ny = "{d.rig.unit_y}"\n'
         head = f'rig = "{d.rig.rig}"\nsample_time = {d.rig.Ts:g}\n'
         write_text(folder / f"{name}.toml", f"{head}{units}[controller]\n{stated}")
-    answer_file.parent.mkdir(parents=True, exist_ok=True)
     write_text(answer_file, json.dumps(answer, indent=1))
     return answer

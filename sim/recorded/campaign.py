@@ -81,7 +81,6 @@ def open_campaign(folder: Path, out: Path, count: int | None, seed: int, tool: t
     kept = out / "rigs.json"
     if kept.exists() and kept.read_text(encoding="utf-8") != stamps:
         raise RefusedError(f"the campaign in {out} was begun with other recordings")
-    out.mkdir(parents=True, exist_ok=True)
     write_text(kept, stamps)
     count = 3 * len(rigs) if count is None else count
     return RecordedCampaign(

@@ -312,7 +312,6 @@ def write(folder: Path, rig: Rig, given: Sequence[Record], kept_back: Sequence[R
     given, kept_back : sequence of Record
         What the tool is given, and what it is marked against.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "model.toml", (rig.folder / "model.toml").read_bytes().decode())
     for i, r in enumerate(given, start=1):
         _write(folder / f"rec{i}.csv", r)
@@ -344,7 +343,6 @@ def conceal(seed: int, rigs: Sequence[Ready], folder: Path, answer_file: Path) -
     """
     made = make(seed, rigs)
     write(folder, made.ready.rig, made.given, made.kept_back)
-    answer_file.parent.mkdir(parents=True, exist_ok=True)
     write_text(answer_file, json.dumps(answer(made, seed), indent=1))
 
 
@@ -363,6 +361,5 @@ def keep_as_recorded(ready: Ready, folder: Path, answer_file: Path) -> None:
     rig = ready.rig
     write(folder, rig, rig.given, rig.kept_back)
     spread = _spread(rig, rig.kept_back[longest(rig.kept_back)]) if rig.kept_back else None
-    answer_file.parent.mkdir(parents=True, exist_ok=True)
     said = {"kind": "as recorded", "rig": rig.name, "horizon": rig.horizon * rig.Ts, "spread": spread}
     write_text(answer_file, json.dumps(said, indent=1))
