@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -150,11 +150,7 @@ def _answer(d: Draw, records: list[Record], physics: Physics, made: tuple[Sized,
         "rows": d.rig.rows,
         "horizon": d.rig.horizon,
         "windows": _windows_of(d, records),
-        "truth_parameters": {
-            **{name: getattr(physics, name) for name in ("K", "tau_actuator", "tau_plant", "tau_sensor", "delay")},
-            "u_offset": physics.u_offset,
-            "y_offset": physics.y_offset,
-        },
+        "truth_parameters": {name: one for name, one in asdict(linear_truth(physics)).items() if name != "integrating"},
         "nrmse_unseen": errors,
         "retuned_train_ratio": round(rms / d.rig.noise_sd, 4),
         "nominal_train_ratio": round(nominal_ratio, 4),

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from sim.conceal.physics import FREE, N_STATES, Floats, Physics, advance, chain_output, command_static
+from sim.conceal.physics import FREE, N_STATES, Floats, Physics, advance, chain_output, command_at, command_static
 
 OPEN_LOOP, PI, PD, RELAY = range(4)
 
@@ -176,7 +176,7 @@ def run_loop(
         end = sampling.t[k + 1] if k + 1 < N else t + Ts
         while t < end:
             while pending <= k and switch[pending] <= t + 1e-12:  # commands that have arrived by now
-                ramp[0], ramp[1], ramp[2] = _reference_at(t, ramp, p), effective[pending], t
+                ramp[0], ramp[1], ramp[2] = command_at(t, ramp, p), effective[pending], t
                 pending += 1
             until = min(end, switch[pending]) if pending <= k else end
             direction, mode = advance(t, until, h, state, ramp, direction, mode, p, work)
@@ -184,11 +184,3 @@ def run_loop(
                 acts[k] = 1.0
             t = until
     return u, y, clean, acts
-
-
-@njit(cache=True)
-def _reference_at(t: float, ramp: Floats, p: Physics) -> float:
-    if p.rate_limit == np.inf:
-        return float(ramp[1])
-    reach = p.rate_limit * (t - ramp[2])
-    return float(ramp[0] + min(max(ramp[1] - ramp[0], -reach), reach))

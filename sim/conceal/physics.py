@@ -274,17 +274,17 @@ def chain_output(s: Floats, p: Physics) -> float:
 def _rk4(t: float, h: float, s: Floats, ramp: Floats, direction: float, mode: int, p: Physics, work: Floats) -> Floats:
     """One classical Runge-Kutta step; ``ramp`` = (value at start, target, start time) of the command."""
     k1, k2, k3, k4 = work[0], work[1], work[2], work[3]
-    derivative(t, s, _command_at(t, ramp, p), direction, mode, p, k1)
-    e = _command_at(t + 0.5 * h, ramp, p)
+    derivative(t, s, command_at(t, ramp, p), direction, mode, p, k1)
+    e = command_at(t + 0.5 * h, ramp, p)
     derivative(t + 0.5 * h, s + 0.5 * h * k1, e, direction, mode, p, k2)
     derivative(t + 0.5 * h, s + 0.5 * h * k2, e, direction, mode, p, k3)
-    derivative(t + h, s + h * k3, _command_at(t + h, ramp, p), direction, mode, p, k4)
+    derivative(t + h, s + h * k3, command_at(t + h, ramp, p), direction, mode, p, k4)
     out: Floats = s + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
     return out
 
 
 @njit(cache=True)
-def _command_at(t: float, ramp: Floats, p: Physics) -> float:
+def command_at(t: float, ramp: Floats, p: Physics) -> float:
     """Command after the rate limit: from the value it had towards the target, never faster than the limit."""
     if p.rate_limit == np.inf:
         return float(ramp[1])

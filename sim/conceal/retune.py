@@ -117,14 +117,9 @@ def _free_runs(A: Floats, b0: Floats, b1: Floats, u: Floats, rows: int, begin: i
     return out
 
 
-def _observability(steps: Steps, length: int) -> Floats:
-    """Rows c A^k, shape (length, n)."""
-    out: Floats = _powers(steps.A, steps.c, length)
-    return out
-
-
 @njit(cache=True)
-def _powers(A: Floats, c: Floats, length: int) -> Floats:
+def _observability(A: Floats, c: Floats, length: int) -> Floats:
+    """Rows c A^k, shape (length, n)."""
     n = len(c)
     out = np.empty((length, n))
     row, after = c.copy(), np.empty(n)
@@ -156,7 +151,7 @@ def residuals(chain: Chain, u: Floats, y: Floats, Ts: float, window: int) -> Flo
     count = len(y) // window
     runs = _free_runs(steps.A, steps.b_before, steps.b_after, u - chain.u_offset, steps.rows, 0, count, window)
     e = y[: count * window].reshape(count, window) - chain.y_offset - runs
-    q, _ = np.linalg.qr(_observability(steps, window))
+    q, _ = np.linalg.qr(_observability(steps.A, steps.c, window))
     out: Floats = (e - (e @ q) @ q.T).ravel()
     return out
 
@@ -249,7 +244,7 @@ def forecast_error(chain: Chain, u: Floats, y: Floats, Ts: float, horizon: int) 
         Rows of a forecast.
     """
     steps = discretise(chain, Ts)
-    rows = _observability(steps, 3 * horizon)
+    rows = _observability(steps.A, steps.c, 3 * horizon)
     fit = np.linalg.pinv(rows[: 2 * horizon])
     errors = []
     du = u - chain.u_offset
