@@ -17,8 +17,9 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
+from typer.testing import CliRunner
 
-from autotune.cli import main
+from autotune.cli import app, main
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,3 +50,10 @@ def autotune(*words: str | Path, cwd: Path) -> Ended:
         signal.signal(signal.SIGINT, interrupt)
         sys.unraisablehook = unraisable
     return Ended(returncode=int(end.value.code or 0), stdout=stdout.getvalue(), stderr=stderr.getvalue())
+
+
+def run(*words: object) -> str:
+    """Run a command that ends well, and return what it prints."""
+    result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output

@@ -19,13 +19,8 @@ from autotune.points import points_to_json
 from autotune.report.page import Section
 from autotune.report.relay_figures import step_responses
 from autotune.report.relay_tables import asymptotic_bandwidth, bandwidth_limit, printed_tables
+from tests.autotune.command import run
 from tests.autotune.design.plants import BALL
-
-
-def run(*words: object) -> str:
-    result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 def test_the_page_of_a_known_plant_has_the_row_of_table_ii(tmp_path):

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
 
 import autotune as at
-from autotune.cli import app
 from autotune.controller import PIDController
 from autotune.design.margins import margins
 from autotune.design.specification import Specification
@@ -24,13 +22,8 @@ from autotune.model_tables import read_model
 from autotune.models import TransferFunction
 from autotune.pipeline.analysis import on_reduced_model
 from autotune.points import points_to_json
+from tests.autotune.command import run
 from tests.autotune.design.plants import BALL, measured
-
-
-def run(*words: object) -> str:
-    result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 def _ball_points(folder: Path) -> Path:

@@ -12,6 +12,7 @@ from autotune.cli import app
 from autotune.controller import PIDController, read_controller, write_controller
 from autotune.model_tables import read_model, write_model
 from autotune.models import Block, Model, Port, TransferFunction
+from tests.autotune.command import run
 from tests.autotune.design.plants import BALL
 
 
@@ -22,12 +23,6 @@ def files(tmp_path):
         write_model(Model(name=name, input=Port(), output=Port(), blocks=(block,)), tmp_path / f"{name}.toml")
     write_controller(PIDController(K=-0.023, Ti_s=3.0), tmp_path / "pi.toml")
     return tmp_path
-
-
-def run(*words: object) -> str:
-    result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 def test_a_known_plant_is_reduced_and_compared_with_its_model(files):

@@ -16,15 +16,10 @@ from autotune.controller import DiscreteController, write_controller
 from autotune.errors import InputError
 from autotune.identification.closed_loop.methods import METHODS
 from autotune.recording import Recording, write_recording
+from tests.autotune.command import run
 from tests.autotune.identification.delay_examples import A, B, example_2
 from tests.autotune.identification.test_modulating import example_3
 from tests.loop_example import CONTROLLER_DEN, CONTROLLER_NUM, PLANT, example_set, simulate_loop, two_by_two
-
-
-def run(*words: object) -> str:
-    result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 @pytest.mark.parametrize("method", ["algebraic", "online", "output-error"])
