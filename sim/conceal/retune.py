@@ -30,12 +30,13 @@ class Chain:
 
 @dataclass(frozen=True, kw_only=True)
 class Steps:
-    """Chain discretised for a held command that switches ``rows + fraction`` sample times late."""
+    """Chain over one sample time; the command switches ``rows`` sample times and a part of one late."""
 
     A: Floats
     b_before: Floats
     b_after: Floats
     c: Floats
+    d: float = 0.0
     rows: int
 
 
@@ -97,23 +98,49 @@ def _exponential(M: Floats) -> Floats:
 
 
 @njit(cache=True)
-def _free_runs(A: Floats, b0: Floats, b1: Floats, u: Floats, rows: int, begin: int, count: int, length: int) -> Floats:
-    """Last state's run over ``count`` windows of ``length`` rows from zero state."""
-    n = len(b0)
-    out = np.empty((count, length))
+def _runs(
+    A: Floats, before: Floats, after: Floats, c: Floats, d: float, u: Floats, rows: int, begin: int, out: Floats
+) -> None:
+    """Fill ``out``, shape (windows, length), with free runs from zero state, window after window from ``begin``."""
+    n = len(c)
     x, z = np.zeros(n), np.zeros(n)
+    count, length = out.shape
     for w in range(count):
         x[:] = 0.0
-        first = begin + w * length
         for i in range(length):
-            out[w, i] = x[n - 1]
-            before = u[max(first + i - rows - 1, 0)]
-            after = u[max(first + i - rows, 0)]
+            k = begin + w * length + i - rows
+            old, new = u[max(k - 1, 0)], u[max(k, 0)]
+            y = d * old
             for a in range(n):
-                z[a] = b0[a] * before + b1[a] * after
-                for b in range(a + 1):
+                y += c[a] * x[a]
+                z[a] = before[a] * old + after[a] * new
+                for b in range(n):
                     z[a] += A[a, b] * x[b]
+            out[w, i] = y
             x, z = z, x
+
+
+def free_runs(steps: Steps, u: Floats, begin: int, count: int, length: int) -> Floats:
+    """Return free runs from zero state, one after the other.
+
+    Parameters
+    ----------
+    steps : Steps
+        The chain's, n states.
+    u : (N,) array
+        Command about zero.
+    begin : int
+        First row.
+    count, length : int
+        Runs, and rows of each.
+
+    Returns
+    -------
+    (count, length) array
+        Outputs about their offset.
+    """
+    out = np.zeros((count, length))
+    _runs(steps.A, steps.b_before, steps.b_after, steps.c, steps.d, u, steps.rows, begin, out)
     return out
 
 
@@ -149,7 +176,7 @@ def residuals(chain: Chain, u: Floats, y: Floats, Ts: float, window: int) -> Flo
     """
     steps = discretise(chain, Ts)
     count = len(y) // window
-    runs = _free_runs(steps.A, steps.b_before, steps.b_after, u - chain.u_offset, steps.rows, 0, count, window)
+    runs = free_runs(steps, u - chain.u_offset, 0, count, window)
     e = y[: count * window].reshape(count, window) - chain.y_offset - runs
     q, _ = np.linalg.qr(_observability(steps.A, steps.c, window))
     out: Floats = (e - (e @ q) @ q.T).ravel()
@@ -250,7 +277,7 @@ def forecast_error(chain: Chain, u: Floats, y: Floats, Ts: float, horizon: int) 
     du = u - chain.u_offset
     for begin in range(0, len(y) - 2 * horizon, horizon):
         length = min(3 * horizon, len(y) - begin)
-        run = _free_runs(steps.A, steps.b_before, steps.b_after, du, steps.rows, begin, 1, length)[0]
+        run = free_runs(steps, du, begin, 1, length)[0]
         e = y[begin : begin + length] - chain.y_offset - run
         errors.append((e - rows[:length] @ (fit @ e[: 2 * horizon]))[2 * horizon :])
     return np.concatenate(errors)

@@ -12,12 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from scipy.linalg import expm
 from scipy.optimize import least_squares
 from scipy.signal import tf2ss
 
 from sim.conceal.physics import Floats
+from sim.conceal.retune import Steps, free_runs
 
 #: Every number of the chain is refitted within this factor of the nominal one.
 WITHIN = 5.0
@@ -64,18 +64,6 @@ class Chain:
         return float(1.0 / np.min(rates)) if len(rates) else 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class Steps:
-    """Chain over one sample time; the command switches ``rows`` sample times and a part of one late."""
-
-    A: Floats
-    before: Floats
-    after: Floats
-    c: Floats
-    d: float
-    rows: int
-
-
 def state_space(blocks: Sequence[Block]) -> tuple[Floats, Floats, Floats, float]:
     """Matrices (A, b, c, d) of the blocks in series, shapes (n, n), (n,), (n,)."""
     A, b, c, d = np.zeros((0, 0)), np.zeros(0), np.zeros(0), 1.0
@@ -112,59 +100,12 @@ def discretise(chain: Chain, Ts: float) -> Steps:
     first, second = expm(M * part), expm(M * (Ts - part))
     return Steps(
         A=second[:n, :n] @ first[:n, :n],
-        before=second[:n, :n] @ first[:n, n],
-        after=second[:n, n],
+        b_before=second[:n, :n] @ first[:n, n],
+        b_after=second[:n, n],
         c=c,
         d=d,
         rows=rows,
     )
-
-
-@njit(cache=True)
-def _runs(
-    A: Floats, before: Floats, after: Floats, c: Floats, d: float, u: Floats, rows: int, begin: int, out: Floats
-) -> None:
-    """Fill ``out``, shape (windows, length), with free runs from zero state, window after window from ``begin``."""
-    n = len(c)
-    x, z = np.zeros(n), np.zeros(n)
-    count, length = out.shape
-    for w in range(count):
-        x[:] = 0.0
-        for i in range(length):
-            k = begin + w * length + i - rows
-            old, new = u[max(k - 1, 0)], u[max(k, 0)]
-            y = d * old
-            for a in range(n):
-                y += c[a] * x[a]
-                z[a] = before[a] * old + after[a] * new
-                for b in range(n):
-                    z[a] += A[a, b] * x[b]
-            out[w, i] = y
-            x, z = z, x
-
-
-def free_runs(steps: Steps, u: Floats, begin: int, count: int, length: int) -> Floats:
-    """Return free runs from zero state, one after the other.
-
-    Parameters
-    ----------
-    steps : Steps
-        The chain's, n states.
-    u : (N,) array
-        Command about zero.
-    begin : int
-        First row.
-    count, length : int
-        Runs, and rows of each.
-
-    Returns
-    -------
-    (count, length) array
-        Outputs about their offset.
-    """
-    out = np.zeros((count, length))
-    _runs(steps.A, steps.before, steps.after, steps.c, steps.d, u, steps.rows, begin, out)
-    return out
 
 
 def start_states(steps: Steps, length: int) -> Floats:

@@ -10,8 +10,9 @@ from scipy.signal import lfilter, lsim
 
 from sim.conceal.retune import Chain as OwnChain
 from sim.conceal.retune import discretise as own_discretise
+from sim.conceal.retune import free_runs
 from sim.recorded import cases, commands, readings
-from sim.recorded.chain import Block, Chain, discretise, forecast_error, free_runs, moved, residuals, retune
+from sim.recorded.chain import Block, Chain, discretise, forecast_error, moved, residuals, retune
 from sim.recorded.effects import BY_NAME, EFFECTS, require_exact, require_no_converter
 from sim.recorded.readings import Scale
 from sim.recorded.rigs import Record, RefusedError, find, read
