@@ -109,6 +109,8 @@ def __getattr__(name: str) -> Any:
     if home is None:
         raise AttributeError(f"module 'autotune' has no attribute {name!r}")
     importlib.import_module("autotune.api.shown")  # results show themselves from the first one on
+    if hasattr(sys, "ps1"):  # a notebook, or a prompt at which a person waits; a program's stderr is its own
+        importlib.import_module("autotune.compiling").announce_compiling()
     module, _, there = home.partition(":")
     value = getattr(importlib.import_module(module), there or name)
     globals()[name] = value

@@ -10,7 +10,6 @@ import typer
 from rich.console import Console
 
 from autotune.cli import app
-from autotune.cli.common import announce_compiling
 
 
 @app.command()
@@ -43,7 +42,6 @@ def batch(
     work.claim()
     console = Console(highlight=False, soft_wrap=True)
     rows = work.done(lambda line: console.print(line, markup=False))
-    announce_compiling()
     bars = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(

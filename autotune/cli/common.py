@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -62,26 +61,6 @@ def warn_of_no_dead_man(config: Config) -> str:
         "no dead-man is mapped: if this computer or the line fails, the device may hold the last command for ever;"
         f" map rig.{place}.heartbeat, or stand at the rig's stop"
     )
-
-
-@cache
-def announce_compiling() -> None:
-    """Say, once, that inner loops are compiled, when the first of them is: why a command is silent for seconds."""
-    from numba.core import event
-
-    class Announcement(event.Listener):  # type: ignore[misc]
-        said = False
-
-        def on_start(self, _: event.Event) -> None:
-            if not self.said:
-                self.said = True
-                when = "once after an installation or for a new model"
-                typer.echo(f"note: compiling, {when}: up to half a minute", err=True)
-
-        def on_end(self, _: event.Event) -> None:
-            """Nothing is said of the end."""
-
-    event.register("numba:compile", Announcement())
 
 
 OVERWRITE = Annotated[bool, typer.Option("--overwrite", help="replace what is at --out; an input never is")]
@@ -144,7 +123,6 @@ class ProgressBar:
         self._progress.update(self._task, completed=share, description=what, left="")
 
     def __enter__(self) -> ProgressBar:
-        announce_compiling()
         self._progress.start()
         return self
 

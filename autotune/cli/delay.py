@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 import typer
 
 from autotune.cli import identify
-from autotune.cli.common import OVERWRITE, announce_compiling
+from autotune.cli.common import OVERWRITE
 from autotune.cli.recordings import R, T, U, Y, read_one, signal_names
 from autotune.outputs import Output
 
@@ -80,7 +80,6 @@ def identify_delay_command(
     record = read_one(recording, signal_names(t, u, y, r))
     if hold is not None:
         record = replace(record, metadata={**record.metadata, "hold": hold})
-    announce_compiling()
     settings: dict[str, Any] = {}
     with Console(stderr=True).status("searching the delay") as status:
         if delays == 1 and method == "output-error":

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from autotune.cli import app
-from autotune.cli.common import OVERWRITE, announce_compiling
+from autotune.cli.common import OVERWRITE
 from autotune.cli.recordings import R, T, U, Y, read_all, read_one, signal_names
 from autotune.errors import InputError
 from autotune.outputs import Output, OutputFolder
@@ -185,7 +185,6 @@ def _progress_shown(begin: str) -> Iterator[Progress]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    announce_compiling()
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
         task = progress.add_task(begin, total=1.0)
         yield lambda what, share: progress.update(task, description=what, completed=share)

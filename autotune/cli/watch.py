@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 import typer
 
 from autotune.cli import app
-from autotune.cli.common import OVERWRITE, announce_compiling
+from autotune.cli.common import OVERWRITE
 from autotune.cli.delay import Hold
 from autotune.cli.recordings import R, T, U, Y, read_one, signal_names
 from autotune.outputs import Output
@@ -107,7 +107,6 @@ def watch(
         phase_margin_rad=math.radians(phase_margin),
         names=signal_names(t, u, y, r),
     )
-    announce_compiling()
     if source.suffix.lower() != ".toml":
         _follow(source, Output(out, inputs=(source, controller), overwrite=overwrite), settings, follow)
         return

@@ -11,13 +11,11 @@ import sys
 import tomllib
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from autotune.cli import app
-from autotune.cli.common import announce_compiling
 from autotune.config import load_config
 from autotune.config.registers import RegisterMap
 from autotune.config.rig import ModbusTcpSettings, SerialSettings, SimulatedRigSettings
@@ -369,15 +367,3 @@ def test_a_run_hands_nothing_over_where_a_second_person_is_asked_for(tmp_path: P
     assert "not handed over: [approval] asks for a second person: autotune deploy" in said
     assert (tmp_path / "out" / "journal.jsonl").read_text().count("gains") == 1  # read, and nothing written
     assert not (tmp_path / "out" / "audit.jsonl").exists()
-
-
-def test_it_is_said_once_that_something_is_compiled_and_not_before_it_is(capsys: pytest.CaptureFixture[str]) -> None:
-    announce_compiling.cache_clear()
-    announce_compiling()
-    kernels = [numba.njit(lambda x, k=k: x + k) for k in (1.0, 2.0)]
-    assert capsys.readouterr().err == ""
-    kernels[0](1.0)
-    assert capsys.readouterr().err.startswith("note: compiling, once after an installation")
-    kernels[1](1.0)
-    announce_compiling()
-    assert capsys.readouterr().err == ""
