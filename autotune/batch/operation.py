@@ -117,10 +117,10 @@ def _how_sure(found: RoutineDiagnosis) -> str:
     of_valve = f"{valves.reversals} reversals, by chance {valves.chance:.2g}"
     match found.verdict:
         case "stiction" | "backlash":
-            return f"{1.0 - math.exp(-valves.decrease):.0%} less error, {of_valve}"
+            return f"{100.0 * (1.0 - math.exp(-valves.decrease)):.0f} % less error, {of_valve}"
         case "tight_tuning" if answer is not None:
-            return f"{answer.explained:.0%} of y foretold by the set-point"
+            return f"{100.0 * answer.explained:.0f} % of y foretold by the set-point"
         case "outside_oscillation":
-            return f"{seen.phase_kept:.0%} of y foretold by one sine over {seen.periods:.0f} periods"
+            return f"{100.0 * seen.phase_kept:.0f} % of y foretold by one sine over {seen.periods:.0f} periods"
         case _:
             return of_valve

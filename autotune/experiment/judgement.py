@@ -293,8 +293,8 @@ def _reason(test: StepTest, expected: Expectation, rms_error: float, accepted: b
     if expected.vacuous:
         return f"nothing is verified: {expected.vacuous}; {REMEDY}"
     if accepted:
-        return f"the loop behaves as predicted: rms error {error}, up to {limit} is explained"
-    return f"the loop does not behave as predicted: rms error {error}, only {limit} is explained"
+        return f"the loop behaves as predicted: rms error {error}, noise and uncertainty explain {limit}"
+    return f"the loop does not behave as predicted: rms error {error}, noise and uncertainty explain only {limit}"
 
 
 def _share_at_limit(test: StepTest, u: FloatArray, law: PILaw) -> float:

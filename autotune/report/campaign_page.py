@@ -81,7 +81,7 @@ def campaign_page(settings: CampaignSettings, rows: Sequence[Row]) -> Page:
     if settings.task == "design":
         summary.append(
             f"Designed for a modulus margin of {asked_modulus:.2g} and a phase margin of {np.degrees(asked_phase):.0f} "
-            "deg. A loop's own page: autotune tune --points loops/NAME.json --out DIR."
+            f"deg. A loop's own page: autotune tune {_own_page(settings)}."
         )
     if settings.task == "routine":
         summary.append(
@@ -126,6 +126,13 @@ def _answers(counts: Counter[Attention], settings: CampaignSettings) -> tuple[tu
     }
     sure = "Every figure rests on the loop's own record; what was left out of it is said under Notes."
     return ("How sure", sure), ("What to do", todo[first])
+
+
+def _own_page(settings: CampaignSettings) -> str:
+    """Return what ``autotune tune`` is to be given to design a loop of the campaign again, with the same gains."""
+    if settings.method == "closed-loop":
+        return "--points loops/NAME.json --out DIR"
+    return "FILE --out DIR, with --u and --y where FILE has several loops"
 
 
 def _section(settings: CampaignSettings, attention: Attention, rows: Sequence[Row]) -> Section:
@@ -239,7 +246,7 @@ def _band(row: Row) -> str:
     if row.band is None or row.band_of_range is None:
         return ""
     unit = f"\N{NO-BREAK SPACE}{row.u_unit}" if row.u_unit else ""
-    return f"{row.band:.3g}{unit} ({row.band_of_range:.0%})"
+    return f"{row.band:.3g}{unit} ({100.0 * row.band_of_range:.0f} %)"
 
 
 def _present_margins(settings: CampaignSettings, rows: Sequence[Row]) -> tuple[Section, ...]:

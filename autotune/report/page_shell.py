@@ -20,6 +20,8 @@ p { max-width: 78ch; margin: 0.5rem 0; }
 nav { display: flex; flex-wrap: wrap; gap: 0.3rem 1rem; margin: 1rem 0; font-size: 0.93rem; }
 a { color: inherit; }
 .wide { overflow-x: auto; margin: 0.8rem 0; } math { width: max-content; margin: 0; padding: 0.2em 0; }
+.wide { background: linear-gradient(to left, var(--paper) 40%, transparent) right / 2rem 100% no-repeat local,
+  linear-gradient(to left, #8889, transparent) right / 0.8rem 100% no-repeat scroll; }  /* a shadow where it goes on */
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.93rem; }
 .caption { color: var(--faint); font-size: 0.93rem; margin-top: 1.2rem; }
 th, td { text-align: left; padding: 0.3rem 0.9rem 0.3rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }

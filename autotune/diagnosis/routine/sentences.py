@@ -25,8 +25,8 @@ def said(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, ...]:
         case "outside_oscillation":
             first = (
                 f"An oscillation from outside with a period of {period}: over {seen.periods:.0f} periods its phase"
-                f" lasts (one sine predicts {seen.phase_kept:.0%} of y on stretches left out), which neither a badly"
-                " damped loop nor a valve that sticks explains."
+                f" lasts (one sine predicts {100.0 * seen.phase_kept:.0f} % of y on stretches left out), which neither"
+                " a badly damped loop nor a valve that sticks explains."
             )
         case "none":
             first = "Nothing found: no regular oscillation, and no fault of the valve that its slips would show."
@@ -46,7 +46,7 @@ def _valve(found: RoutineDiagnosis) -> str:
     name = "Stiction" if found.verdict == "stiction" else "Play (backlash)"
     said = (
         f"{name} in the valve: the command must turn by {band.value:.3g} ({band.low:.3g} to {band.high:.3g}, {unit};"
-        f" {band.value / span:.0%} of u's range) before the valve follows"
+        f" {100.0 * band.value / span:.0f} % of u's range) before the valve follows"
     )
     if found.verdict == "stiction":
         said += f", and it then slips by {jump.value:.3g} ({jump.low:.3g} to {jump.high:.3g})"
@@ -58,7 +58,7 @@ def _compared(found: RoutineDiagnosis) -> str:
     change = abs(1.0 - math.exp(-valves.decrease))
     less = "less" if valves.decrease >= 0.0 else "more"
     return (
-        f"The position of the best faulty valve predicts y with {change:.0%} {less} squared"
+        f"The position of the best faulty valve predicts y with {100.0 * change:.0f} % {less} squared"
         f" error than the command does, over {valves.reversals} reversals of that valve; by chance it gains as much"
         f" with a probability of {valves.chance:.2g}."
     )
@@ -66,7 +66,8 @@ def _compared(found: RoutineDiagnosis) -> str:
 
 def _reservations(found: RoutineDiagnosis, limits: RoutineThresholds) -> tuple[str, ...]:
     part = found.operation.seen
-    said = (f"Looked at: the {part:.0%} of the recorded time in which u travels furthest.",) if part < 1.0 else ()
+    looked_at = f"Looked at: the {100.0 * part:.0f} % of the recorded time in which u travels furthest."
+    said = (looked_at,) if part < 1.0 else ()
     return (*_reasons(found, limits), *said)
 
 

@@ -109,6 +109,15 @@ def test_loops_that_were_only_identified_are_not_said_to_be_fine():
     assert "Nothing is said of the gains in use" in dict(page.answers)["What to do"]
 
 
+def test_a_campaigns_page_names_the_command_that_designs_a_loop_as_the_campaign_did():
+    """Points alone are not what a design from recordings rests on; a subspace model's points are."""
+    rows = [Row(loop="TIC1", attention="fine", K=1.0, Ti_s=90.0)]
+    said = " ".join(campaign_page(CampaignSettings(name="a"), rows).summary)
+    assert "autotune tune FILE --out DIR, with --u and --y where FILE has several loops" in said
+    by_subspace = campaign_page(CampaignSettings(name="a", method="closed-loop"), rows)
+    assert "autotune tune --points loops/NAME.json --out DIR" in " ".join(by_subspace.summary)
+
+
 def test_a_campaigns_page_shows_every_loops_plant_and_says_what_to_do(tmp_path):
     figures = plant_figures(TransferFunction(num=(0.8,), den=(90.0, 1.0), delay_s=20.0))
     rows = [
