@@ -145,19 +145,18 @@ def find_midpoint(
     """
     limits = loop.envelope.settings
     tell("catching the plant and finding the relay's mid-point")
-    room = min(known.midpoint - limits.u_min, limits.u_max - known.midpoint)
-    # where ramp or pushes have told the mid-point roughly, the relay need not reach across all of its uncertainty
-    reach = 0.4 if known.sign_seen else BRACKET
-    amplitude = min(largest or reach * point.u_uncertainty, 0.9 * room)
+    midpoint, reach = _where_relay_begins(loop, point, known)
+    room = min(midpoint - limits.u_min, limits.u_max - midpoint)
+    amplitude = min(largest or reach, 0.9 * room)
     if amplitude <= 0.0:
         raise ExperimentStopped(
-            f"saturated: the mid-point {known.midpoint:.4g} is at the end of the command's range",
+            f"saturated: the mid-point {midpoint:.4g} is at the end of the command's range",
             where="find the mid-point",
             remedy="choose another operating point, or widen limits.u_min..u_max",
         )
     settings = RelaySettings(
         y_centre=known.y_moved + LEAD * (point.y - known.y_moved),
-        midpoint=known.midpoint,
+        midpoint=midpoint,
         amplitude=amplitude,
         hysteresis=2.5 * known.noise_sd / math.sqrt(FIRST_SMOOTHING),
         smoothing=FIRST_SMOOTHING,
@@ -173,6 +172,19 @@ def find_midpoint(
     _lead(oscillation, point.y, known)
     loop.watch = Watch(y_centre=point.y, in_range=True)
     return _balance(oscillation, largest, known, tell), oscillation
+
+
+def _where_relay_begins(loop: ControlLoop, point: OperatingPointSettings, known: Known) -> tuple[float, float]:
+    """Return the first mid-point and how far the relay reaches to either side of it [u unit]."""
+    if not known.sign_seen:
+        return known.midpoint, BRACKET * point.u_uncertainty
+    # where ramp or pushes have told the mid-point roughly, the relay need not reach across all of its uncertainty
+    reach, aside = 0.4 * point.u_uncertainty, known.midpoint - point.u_guess
+    if point.approach == "hold" and known.plant_sign * aside * (loop.tick.y - point.y) > 0.0:
+        # y is where u_guess is too much if anything, and the pushes asked for more: they were seen from y's way back,
+        # on which it does not stand still at the command that holds the operating point. The relay reaches both.
+        return known.midpoint - 0.5 * aside, reach + 0.5 * abs(aside)
+    return known.midpoint, reach
 
 
 def _lead(oscillation: Oscillation, y: float, known: Known) -> None:

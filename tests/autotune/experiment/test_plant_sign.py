@@ -6,14 +6,16 @@ from pathlib import Path
 
 import pytest
 
+from autotune.config import load_config
 from autotune.equations.chain import from_chain
 from autotune.equations.transfer_text import parse_transfer_function
-from autotune.experiment.approach import approach
+from autotune.experiment.approach import approach, find_midpoint
 from autotune.experiment.preflight import Known, preflight
 from autotune.models import Block, Model, Port
 from drivers.model_plant import ModelPlant
 from drivers.simulated import SimulatedRig
-from tests.autotune.experiment.rigs import ball_config, open_loop
+from sim.tank import make_two_tank
+from tests.autotune.experiment.rigs import CONFIG, ball_config, open_loop
 
 #: command that holds y at 0 [V]
 U_REST = 5.0
@@ -74,3 +76,17 @@ def test_a_plant_that_goes_on_after_the_command_has_turned(
     known = learn_sign(tmp_path, written, time_s=time_s, samples=40.0, swing=0.125 * abs(gain), u_before=U_REST)
     assert known.plant_sign * gain > 0.0
     assert known.midpoint == pytest.approx(U_REST, abs=0.25)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_mid_point_is_found_of_tanks_that_the_pushes_led_away_from_the_operating_point(
+    tmp_path: Path, seed: int
+) -> None:
+    """The pump's gain is up to a tenth off: y goes where, on its way back, more command seems to be needed."""
+    config, plant = load_config(CONFIG.with_name("two_tank_sim.toml")), make_two_tank(seed=seed, start="level")
+    point, said = config.operating_point, lambda _: None
+    with open_loop(SimulatedRig(plant, u_safe=0.0), tmp_path / "recording.csv", config) as loop:
+        known = preflight(loop, point, config.experiment.gain_sd, said)
+        known, _ = find_midpoint(loop, point, None, approach(loop, point, known, said), said)
+    assert known.plant_sign == 1
+    assert known.midpoint == pytest.approx(plant.u_rest, abs=0.05)
