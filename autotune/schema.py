@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import difflib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -20,6 +20,10 @@ Root = TypeVar("Root", bound=BaseModel)
 
 #: Largest size of a gain or signal value, far beyond every unit and far below where arithmetic overflows.
 LARGEST = 1e15
+#: keys that are named beside the first one that is wrong
+_MOST_NAMED = 3
+#: what pydantic puts before a refusal of the project's own
+_OWN = "Value error, "
 #: Shortest and longest time [s]: a microsecond, thirty years.
 SHORTEST_S, LONGEST_S = 1e-6, 1e9
 
@@ -67,24 +71,56 @@ def validate(root: type[Root], content: Mapping[str, Any], where: str, *, texts:
 
 
 def _refusal(error: ValidationError, root: type[BaseModel], where: str) -> InputError:
-    details = error.errors(include_url=False)
+    details = _without_misspelt(error.errors(include_url=False), root)
     first = next((d for d in details if d["type"] == "extra_forbidden"), details[0])
-    at = _key_path(first, root)
-    path = shorten(".".join(str(part) for part in at))
-    more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
-    if first["type"] == "extra_forbidden":
-        key = str(first["loc"][-1])
-        known = _known_keys(root, at[:-1])
-        near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-        remedy = f"did you mean {near[0]!r}?" if near else f"known keys here: {', '.join(known)}"
-        return InputError(f"unknown key {path!r}{more}", where=where, remedy=remedy)
-    if first["type"] == "missing":
-        return InputError(f"{path!r} is missing{more}", where=where, remedy=_describe(root, at))
-    value = first.get("input")
+    what, remedy = _what_is_wrong(first, root)
+    others = [_named(_key_path(one, root)) or one["msg"].removeprefix(_OWN) for one in details if one is not first]
+    if others:
+        rest = f" and {len(others) - _MOST_NAMED} more" if len(others) > _MOST_NAMED else ""
+        what += f" (also wrong: {', '.join(others[:_MOST_NAMED])}{rest})"
+    return InputError(what, where=where, remedy=remedy)
+
+
+def _without_misspelt(details: list[ErrorDetails], root: type[BaseModel]) -> list[ErrorDetails]:
+    """Leave out keys that are missing because they are misspelt: they are said once, as the unknown key."""
+    meant = set()
+    for detail in details:
+        if detail["type"] == "extra_forbidden":
+            *table, key = _key_path(detail, root)
+            meant |= {(*table, near) for near in _nearest(str(key), _known_keys(root, tuple(table)))}
+    return [one for one in details if one["type"] != "missing" or _key_path(one, root) not in meant]
+
+
+def _what_is_wrong(detail: ErrorDetails, root: type[BaseModel]) -> tuple[str, str]:
+    """Return what is wrong with a key, and the remedy."""
+    at, given = _key_path(detail, root), detail.get("ctx", {})
+    match detail["type"]:
+        case "extra_forbidden":
+            known = _known_keys(root, at[:-1])
+            near = _nearest(str(detail["loc"][-1]), known)
+            remedy = f"did you mean {near[0]!r}?" if near else f"known keys here: {', '.join(known)}"
+            return f"unknown key {_named(at)!r}", remedy
+        case "union_tag_invalid":
+            kinds = str(given["expected_tags"]).replace("'", "")
+            near = _nearest(str(given["tag"]), kinds.split(", "))
+            remedy = f"did you mean {near[0]!r}?" if near else _describe(root, at[:-1])
+            return f"{_named(at)} = {shorten(repr(given['tag']))} is none of {kinds}", remedy
+        case "union_tag_not_found":
+            return f"{_named(at)!r} is missing", _describe(root, at[:-1])
+        case "missing":
+            return f"{_named(at)!r} is missing", _describe(root, at)
+    value = detail.get("input")
     shown = f" = {shorten(repr(value))}" if isinstance(value, str | int | float | bool) else ""
-    reason = first["msg"].removeprefix("Value error, ")
-    key = f"{path}{shown}: " if path else ""  # what holds between keys of the whole file has no path
-    return InputError(f"{key}{reason}{more}", where=where, remedy=_describe(root, at))
+    key = f"{_named(at)}{shown}: " if at else ""  # what holds between keys of the whole file has no path
+    return f"{key}{detail['msg'].removeprefix(_OWN)}", _describe(root, at)
+
+
+def _named(path: tuple[str | int, ...]) -> str:
+    return shorten(".".join(str(part) for part in path))
+
+
+def _nearest(key: str, known: Sequence[str]) -> list[str]:
+    return difflib.get_close_matches(key, known, n=1, cutoff=0.5)
 
 
 def shorten(text: str) -> str:
@@ -101,6 +137,8 @@ def _key_path(detail: ErrorDetails, root: type[BaseModel]) -> tuple[str | int, .
         last = i == len(detail["loc"]) - 1
         if isinstance(part, int) or part in known or not known or (last and detail["type"] == "extra_forbidden"):
             path.append(part)
+    if detail["type"].startswith("union_tag_"):
+        path.append(str(detail["ctx"]["discriminator"]).strip("'"))
     return tuple(path)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tomllib
 import unicodedata
 from collections.abc import Callable
@@ -124,8 +125,24 @@ def _parse(path: str | os.PathLike[str], parse: Callable[[str], Any], kind: str)
             f"tables or lists are nested deeper than {DEEPEST_NESTING}", where=str(path), remedy="write it flat"
         ) from None
     except ValueError as error:
-        raise InputError(f"not {kind}: {_short(error)}", where=str(path), remedy="correct the line") from None
+        line, remedy = _line_of(error, text)
+        raise InputError(f"not {kind}: {_short(error)}{line}", where=str(path), remedy=remedy) from None
     return content
+
+
+def _line_of(error: ValueError, text: str) -> tuple[str, str]:
+    """Return the line that a parser names, to be shown, and what is wrong with it where that is usual."""
+    at, lines = re.search(r"\bat line (\d+), column", str(error)), text.split("\n")
+    if at is None or int(at[1]) > len(lines):
+        return "", "correct the line"
+    line = lines[int(at[1]) - 1].split("#")[0].strip()
+    shown = f": {printable(line[:80])}"
+    value = line.partition("=")[2].strip()
+    if re.fullmatch(r"[-+]?\d+,\d+", value):
+        return shown, "write the decimal mark as a point"
+    if value.count('"') % 2:
+        return shown, "close the quotes"
+    return shown, "put texts in quotes" if re.match(r"[^\W\d]", value) else "correct the line"
 
 
 def _short(error: ValueError) -> str:

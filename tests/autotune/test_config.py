@@ -78,6 +78,13 @@ def test_margins_replace_those_of_the_named_specification(tmp_path: Path) -> Non
             r"budget_s = 1e-06 .*100 samples of 0\.01",
         ),
         ("name = ", "name ", "not TOML"),
+        ("u_max = 10.0", "u_max = 10,0", r"not TOML.*line 10.*: u_max = 10,0; write the decimal mark as a point"),
+        ('plant = "ball"', "plant = ball", r"not TOML.*line 5.*: plant = ball; put texts in quotes"),
+        ('plant = "ball"', 'plant = "ball', r'not TOML.*line 5.*: plant = "ball; close the quotes'),
+        ("u_max = 10.0", "u_max = 10.0.", r"not TOML.*line 10.*: u_max = 10\.0\.; correct the line"),
+        ('kind = "simulated"', 'kind = "simulate"', r"rig\.kind = 'simulate' is none of.*did you mean 'simulated'\?"),
+        ('kind = "simulated"', 'kind = "balloon"', r"rig\.kind = 'balloon' is none of.*; how the rig is reached"),
+        ('kind = "simulated"', "", r"'rig\.kind' is missing; how the rig is reached"),
     ],
 )
 def test_a_refused_key_is_named_with_its_path_range_and_nearest_name(
@@ -89,6 +96,16 @@ def test_a_refused_key_is_named_with_its_path_range_and_nearest_name(
         load_config(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_all_that_is_wrong_is_named_at_once_and_a_misspelt_key_is_not_missing_too(tmp_path: Path) -> None:
+    wrong = COMPLETE.replace("swing", "swnig").replace("u_safe = 0.0", 'u_safe = "zero"')
+    with pytest.raises(InputError, match=r"'limits\.swnig' \(also wrong: limits\.u_safe\); did you mean 'swing'\?$"):
+        load_config(write(tmp_path, wrong))
+    for key in ("u_min", "u_max", "y_min", "y_max"):
+        wrong = wrong.replace(f"{key} = ", f"{key} = 1e99 #")
+    with pytest.raises(InputError, match=r"\(also wrong: limits\.u_min, limits\.u_max, limits\.u_safe and 2 more\)"):
+        load_config(write(tmp_path, wrong))
 
 
 def test_every_key_of_the_schema_says_what_it_is() -> None:
