@@ -145,7 +145,11 @@ def init(
     kinds = {one.name: one for one in KINDS}
     question = f"how is the rig reached ({', '.join(kinds)})"
     chosen: Kind = questions.ask(
-        "--kind", kind, question, lambda name: kinds[one_of(name, kinds, "--kind")], suggested="simulated"
+        "--kind",
+        kind,
+        question,
+        lambda name: kinds[one_of(name.replace("-", "_"), kinds, "--kind")],
+        suggested="simulated",
     )
     questions.require()  # the others hang on it
     simulated = chosen.settings is SimulatedRigSettings
@@ -187,6 +191,10 @@ def init(
         console.print(f"next: autotune run {config} --out runs/{config.stem}", markup=False)
     else:
         console.print(f"next: read it through, then autotune doctor {config}, autotune probe {config}", markup=False)
+
+
+def _underscored(name: str) -> str:
+    return name.replace("-", "_")  # modbus-tcp, as people write it
 
 
 def _plant_or_model(answer: str) -> str | ModelOfRig:

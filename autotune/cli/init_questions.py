@@ -51,7 +51,8 @@ class Questions:
                 self._missing.append(flag)
             return default
         offered = default if suggested is None else suggested
-        return typer.prompt(question, default=offered, value_proc=_ask_again_where_refused(convert))
+        check = _ask_again_where_refused(convert, is_needed=offered is None)
+        return typer.prompt(question, default=offered or "", show_default=bool(offered), value_proc=check)
 
     def require(self) -> None:
         """Refuse where an answer is missing.
@@ -66,10 +67,12 @@ class Questions:
             raise InputError(f"{flags}: no answer", where="autotune init", remedy="give them, or call it at a terminal")
 
 
-def _ask_again_where_refused(convert: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Let a question be asked again where its answer is refused."""
+def _ask_again_where_refused(convert: Callable[[str], Any], *, is_needed: bool) -> Callable[[str], Any]:
+    """Let a question be asked again where its answer is refused, or missing and needed."""
 
     def check(answer: str) -> Any:
+        if is_needed and not answer.strip():
+            raise typer.BadParameter("an answer is needed; Ctrl-C leaves, and nothing is written")
         try:
             return convert(answer)
         except ValueError as error:

@@ -108,6 +108,10 @@ def config_of(rig: Table, answers: Table) -> Table:
         raise InputError(f"y = {answers['y']:g} is not within {y_min:g}..{y_max:g}", where="operating_point.y")
     # a quarter of the room leaves the rest to overshoot; rounded to what a person would have written
     swing = round_to_two(0.25 * room)
+    # no further than half of the way to the end of the command's range, where a relay would have no room; a command at
+    # the very end is refused as such
+    room_u = min(answers["u"] - u_min, u_max - answers["u"]) or u_max - u_min
+    uncertainty = min(0.05 * (u_max - u_min), 0.5 * room_u)
     T_s = answers["sample_time_s"]
     budget_s = max(60.0, round_to_two(SWEEP_SAMPLES * T_s))
     return {
@@ -116,7 +120,7 @@ def config_of(rig: Table, answers: Table) -> Table:
         "limits": {"u_min": u_min, "u_max": u_max, "u_safe": answers["u_safe"],
                    "y_min": y_min, "y_max": y_max, "swing": swing, "time_s": 4.0 * budget_s},
         "operating_point": {"y": answers["y"], "u_guess": answers["u"],
-                            "u_uncertainty": round_to_two(0.05 * (u_max - u_min)), "approach": "hold"},
+                            "u_uncertainty": round_to_two(uncertainty), "approach": "hold"},
         "experiment": {"points": 5, "budget_s": budget_s},
     }  # fmt: skip
 

@@ -247,6 +247,25 @@ def test_an_answer_that_cannot_be_is_asked_for_again_at_once(tmp_path: Path) -> 
     assert (content.limits.u_max, content.operating_point.y, content.operating_point.u_guess) == (100.0, 5.0, 30.0)
 
 
+def test_enter_where_an_answer_is_needed_is_said_to_be_none_and_a_kind_may_have_a_hyphen(tmp_path: Path) -> None:
+    answers = "modbus-tcp\n\nplc\ninput:0:float32\nholding:0:float32\n\n%\nbar\n1\n0 100\n0\n0 10\n\n\n30\n"
+    said, status = typed(["init", "plc.toml"], answers, tmp_path)
+    assert status == 0, said
+    assert said.count("Error: an answer is needed; Ctrl-C leaves, and nothing is written") == 2
+    assert "[]" not in said
+    assert load_config(tmp_path / "plc.toml").rig.kind == "modbus_tcp"
+
+
+@pytest.mark.parametrize(("u", "uncertainty"), [("30", 5.0), ("2.5", 1.2), ("97", 1.5)])
+def test_the_first_pushes_of_a_rig_stay_within_the_range_of_its_command(
+    tmp_path: Path, u: str, uncertainty: float
+) -> None:
+    answers = f"simulated\nK=2 T=10 L=1\n%\nbar\n1\n0 100\n0\n0 10\n\n{u}\n"
+    said, status = typed(["init", "rig.toml"], answers, tmp_path)
+    assert status == 0, said
+    assert load_config(tmp_path / "rig.toml").operating_point.u_uncertainty == uncertainty
+
+
 def test_a_transfer_function_as_it_is_written_becomes_the_model_of_twin_or_simulated_rig(tmp_path: Path) -> None:
     written = "-65.5/(s(0.36s+1)) e^-0.1s"
     command("init", tmp_path / "oven.toml", "--kind", "simulated", "--model", "K=2 T=10,2 L=0.5", *REAL)
