@@ -352,7 +352,7 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
         raise InputError(
             f"the header lacks {', '.join(missing)}",
             where=str(path),
-            remedy="name the columns with --t --u --y, or write a file in the project's form with autotune import",
+            remedy="write it in the project's form with autotune import FILE --out REC.csv",
         )
     if len(set(header)) != len(header):
         raise InputError("the header names a column twice", where=str(path), remedy="give each column its own name")

@@ -187,7 +187,7 @@ def init(
     place.text(text_of(content, config))
     console = Console(highlight=False, soft_wrap=True)
     console.print(f"wrote {config}" + (f" and {written}" if written else ""), markup=False)
-    if simulated:
+    if simulated or chosen.name == "replay":
         console.print(f"next: autotune run {config} --out runs/{config.stem}", markup=False)
     else:
         console.print(f"next: read it through, then autotune doctor {config}, autotune probe {config}", markup=False)

@@ -22,7 +22,7 @@ _ASKED = {
     "host": "address of the device",
     "endpoint": "address of the OPC UA server, opc.tcp://HOST:4840",
     "device": "serial device (autotune ports lists them)",
-    "recording": "recording to replay, NAME.csv",
+    "recording": "recording of a run, NAME.csv, which a run with the same settings replays",
     "y_span": "y at count 0 and at the converter's full scale",
     "u_span": "u at duty 0 and at duty 1",
 }

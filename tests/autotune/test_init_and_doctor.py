@@ -256,6 +256,13 @@ def test_enter_where_an_answer_is_needed_is_said_to_be_none_and_a_kind_may_have_
     assert load_config(tmp_path / "plc.toml").rig.kind == "modbus_tcp"
 
 
+def test_what_comes_next_of_a_rig_that_cannot_be_probed_is_a_run(tmp_path: Path) -> None:
+    said = command("init", tmp_path / "again.toml", "--kind", "replay", "--recording", "rec.csv", *REAL)
+    assert "next: autotune run" in said
+    with pytest.raises(InputError, match="no registers and nothing else to read"):
+        command("probe", tmp_path / "again.toml")
+
+
 @pytest.mark.parametrize(("u", "uncertainty"), [("30", 5.0), ("2.5", 1.2), ("97", 1.5)])
 def test_the_first_pushes_of_a_rig_stay_within_the_range_of_its_command(
     tmp_path: Path, u: str, uncertainty: float
