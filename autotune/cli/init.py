@@ -145,11 +145,7 @@ def init(
     kinds = {one.name: one for one in KINDS}
     question = f"how is the rig reached ({', '.join(kinds)})"
     chosen: Kind = questions.ask(
-        "--kind",
-        kind,
-        question,
-        lambda name: kinds[one_of(name.replace("-", "_"), kinds, "--kind")],
-        suggested="simulated",
+        "--kind", kind, question, lambda name: kinds[one_of(_underscored(name), kinds, "--kind")], suggested="simulated"
     )
     questions.require()  # the others hang on it
     simulated = chosen.settings is SimulatedRigSettings
