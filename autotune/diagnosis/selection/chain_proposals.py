@@ -98,7 +98,7 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
             found = _starts(base, self.in_units_of(base))
             if base.leaves_noise:
                 found = [s for s in found if s.decrease > PROMISING * _charge(s)]
-            found.sort(key=lambda s: -s.decrease - 2.0 * s.counted * math.log(s.odds))
+            found.sort(key=lambda s: -s.decrease - 2.0 * math.log(s.odds))
             starts += [s for k, s in enumerate(found) if k < self.limits.tried or s.odds >= PRIOR_ODDS["usual"]]
         best: dict[frozenset[str], tuple[Fit, _Start]] = {}
         for s, result in zip(starts, self.pool.map(_fit_added, starts), strict=True):
@@ -107,7 +107,7 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
             key = frozenset((*s.base.names, s.kind.name))
             if key not in best or _absolute(result, s.bench) < _absolute(best[key][0], best[key][1].bench):
                 best[key] = result, s
-        order = sorted(best.values(), key=lambda one: one[0].cost - 2.0 * one[1].counted * one[1].log_odds)
+        order = sorted(best.values(), key=lambda one: one[0].cost - 2.0 * one[1].log_odds)
         able = [[one for one in order if one[1].base is base][: self.limits.tried] for base in beam]
         chosen = [one for group in able for one in group]
         done = self.pool.map(lambda one: one[1].bench.judged(one[0], one[1].log_odds), chosen)
@@ -225,14 +225,6 @@ class _Start:
     near: Fit
     data: Data
     decrease: float
-
-    @property
-    def counted(self) -> bool:
-        """Whether prior odds count in what is tried: not while costs are in units of a residual that is no noise.
-
-        In those the evidence for what is true is small beside any prior odds, until it is found.
-        """
-        return self.base.leaves_noise
 
     @property
     def log_odds(self) -> float:

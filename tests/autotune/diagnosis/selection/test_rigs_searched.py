@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +15,8 @@ from autotune.diagnosis.fitting.retuning import prepare
 from autotune.diagnosis.selection.chain_proposals import search_chain
 from autotune.diagnosis.selection.judged_chain import JudgedChain, at_both_scales
 from autotune.diagnosis.selection.prediction import extend
-from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.simulation.chain import build_chain
-from autotune.diagnosis.thresholds import IN_USE, Thresholds
+from autotune.diagnosis.thresholds import IN_USE
 from autotune.effects import ALL, related_effects
 from autotune.effects.rigs import rig_kind
 from autotune.model_tables import read_model
@@ -255,33 +253,20 @@ def test_numbers_of_what_integrates_do_not_hang_on_which_of_its_fits_is_taken():
     assert level(at_both_scales(best, [stuck, best])) == pytest.approx(1.2, rel=0.3)
 
 
-def search_case(folder: Path, sought: set[str], limits: Thresholds) -> Found[JudgedChain]:
-    """Search a concealed case's two recordings for some effects."""
-    recordings = [read_recording(folder / name) for name in ("rec1.csv", "rec2.csv")]
-    left_out = [k.name for k in ALL if k.name not in sought]
-    model, rows = read_model(folder / "model.toml"), [np.isfinite(r.y) for r in recordings]
-    return search_chain(model, recordings, rows, left_out=left_out, limits=limits)
-
-
 def test_beside_an_effect_that_does_not_lead_alone_the_next_one_is_sought_in_what_that_leaves(tmp_path):
     """An oven that radiates and a valve that sticks: either alone is too rare to lead, and a first look tells both.
 
     What an effect promises beside another is counted in units of what the other leaves, not of what both leave.
     """
+    write_case(310219, tmp_path, tmp_path / "answer.json")
+    recordings = [read_recording(tmp_path / name) for name in ("rec1.csv", "rec2.csv")]
     both = {"plant.radiation_loss", "actuator.stiction"}
     events = {"environment.loss_step", "environment.gain_step", "actuator.gain_drift", "timing.clock_error"}
     lags = {"actuator.lag", "sensor.lag", "timing.dead_time"}
     others = {"actuator.backlash", "actuator.saturation"}
-    write_case(310219, tmp_path, tmp_path / "answer.json")
-    found = search_case(tmp_path, both | events | lags | others, replace(IN_USE, rig_effects=2))
-    assert set(found.chosen.names) == both
-
-
-def test_what_promises_most_is_tried_before_what_is_usual_while_what_is_left_is_no_noise(tmp_path):
-    """A rail that pulls to and fro beside a load that swings: both rare, and each decides once the other is there."""
-    both = {"plant.sine_torque", "environment.periodic_load"}
-    usual = {"plant.coulomb_friction", "plant.stribeck_friction"}
-    less_rare = {"actuator.dead_zone", "actuator.backlash", "actuator.saturation"}
-    write_case(310277, tmp_path, tmp_path / "answer.json")
-    found = search_case(tmp_path, both | usual | less_rare, replace(IN_USE, rig_effects=2, tried=3))
+    found = search_chain(
+        read_model(tmp_path / "model.toml"), recordings, [np.isfinite(r.y) for r in recordings],
+        left_out=[k.name for k in ALL if k.name not in both | events | lags | others],
+        limits=replace(IN_USE, rig_effects=2),
+    )  # fmt: skip
     assert set(found.chosen.names) == both
