@@ -105,7 +105,7 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
             if result is None or result.cost > s.base.fit.cost - 0.3:
                 continue
             key = frozenset((*s.base.names, s.kind.name))
-            if key not in best or _absolute(result, s.bench) < _absolute(best[key][0], best[key][1].bench):
+            if key not in best or _absolute(result, s.base.data) < _absolute(best[key][0], best[key][1].base.data):
                 best[key] = result, s
         order = sorted(best.values(), key=lambda one: one[0].cost - 2.0 * one[1].log_odds)
         able = [[one for one in order if one[1].base is base][: self.limits.tried] for base in beam]
@@ -129,13 +129,15 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
         """Return hypotheses with each of their effects left out."""
         given = {k.name: math.log(o) for k, o in self.odds}
 
-        def judge_without(one: JudgedChain, index: int) -> JudgedChain | None:
+        def judge_without(one: JudgedChain, at: Bench, index: int) -> JudgedChain | None:
             fewer = fit_without(one.fit, index, one.data)
             own = sum(given.get(n, -math.inf) for i, n in enumerate(one.names) if i != index)
-            return None if fewer is None else self.in_units_of(one).judged(fewer, max(own, one.log_odds))
+            return None if fewer is None else at.judged(fewer, max(own, one.log_odds))
 
-        each = at_once(lambda one: list(self.pool.map(partial(judge_without, one), range(len(one.names)))), some)
-        return [j for group in each for j in group if j is not None]
+        def judge_smaller(one: JudgedChain) -> list[JudgedChain | None]:
+            return list(self.pool.map(partial(judge_without, one, self.in_units_of(one)), range(len(one.names))))
+
+        return [j for group in at_once(judge_smaller, some) for j in group if j is not None]
 
     def finish_leading(self, found: Sequence[JudgedChain]) -> list[JudgedChain]:
         """Return the leading hypotheses fitted to the end, and what is larger fitted on from where the first one is."""
@@ -203,14 +205,14 @@ def _fit_from_best(best: JudgedChain, larger: JudgedChain, bench: Bench) -> Judg
         result = fit(p, bench.long, theta, states, iterations=LAST_STEPS, inherit=best.fit)
     except RUNAWAY:
         return None
-    if _absolute(result, bench) >= _absolute(larger.fit, bench.in_units_of(larger)):
+    if _absolute(result, bench.long) >= _absolute(larger.fit, larger.data):
         return None
     return bench.judged(result, larger.log_odds)
 
 
-def _absolute(result: Fit, bench: Bench) -> float:
-    """Return a fit's cost in the reading's unit squared, from units of the bench that it was fitted on."""
-    return result.cost * bench.long.noise.sd**2
+def _absolute(result: Fit, data: Data) -> float:
+    """Return a fit's cost in the reading's unit squared, from units of the data that it was fitted to."""
+    return result.cost * data.noise.sd**2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
