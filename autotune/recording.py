@@ -191,6 +191,18 @@ class Recording:
         extra = {name: values[keep] for name, values in self.extra.items()}
         return replace(self, t=t, u=self.u[keep], y=self.y[keep], extra=MappingProxyType(extra))
 
+    @property
+    def first_reading(self) -> int:
+        """Row of the first reading; 0 where there is none."""
+        return int(np.argmax(np.isfinite(self.y)))
+
+    @check_arguments
+    def read_from(self, row: int) -> Recording:
+        """Return the recording without the readings before a row; what was commanded before it stays."""
+        y = np.array(self.y, dtype=float)
+        y[:row] = np.nan
+        return replace(self, y=y)
+
     @check_arguments
     def resampled(self, dt_s: float) -> Recording:
         """Return the recording on a uniform grid: commands held, other columns linearly interpolated.

@@ -39,7 +39,10 @@ Part: TypeAlias = tuple[Recording, ...]
 
 
 def parts_of(recordings: Sequence[Recording], least_rows: int) -> tuple[Part, ...]:
-    """Return the recordings without their first fifth, and without their last one.
+    """Return the recordings without the readings of their first fifth, and without their last fifth.
+
+    What was commanded in the first fifth stays: a play, a dead time or a swinging load bring it along, and times count
+    from the same row.
 
     Parameters
     ----------
@@ -50,13 +53,13 @@ def parts_of(recordings: Sequence[Recording], least_rows: int) -> tuple[Part, ..
     """
     if any((1.0 - LEFT_OUT) * np.isfinite(r.y).sum() < 2 * least_rows for r in recordings):
         return ()
-    cuts = ((LEFT_OUT, 1.0), (0.0, 1.0 - LEFT_OUT))
-    return tuple(tuple(r.only(np.arange(int(a * len(r)), int(b * len(r)))) for r in recordings) for a, b in cuts)
+    later = tuple(r.read_from(int(LEFT_OUT * len(r))) for r in recordings)
+    return later, tuple(r.only(slice(int((1.0 - LEFT_OUT) * len(r)))) for r in recordings)
 
 
 def tells(part: Part, began: Sequence[tuple[int, float]]) -> bool:
     """Whether an effect that begins at given times, if any, begins in a part: else no change is seen there."""
-    return not began or any(part[i].t[0] < start < part[i].t[-1] for i, start in began)
+    return not began or any(part[i].t[part[i].first_reading] < start < part[i].t[-1] for i, start in began)
 
 
 def agreement(

@@ -34,7 +34,7 @@ def unmoved(model: Model, recordings: Sequence[Recording]) -> tuple[str, ...]:
     Those that act on the command are a constant there, and what only bends or delays the reading is the plant in other
     coordinates. A recording that begins at the model's rest under another command begins with a step.
     """
-    if any(float(np.ptp(r.u)) > 0.0 or _begins_with_a_step(model, r) for r in recordings):
+    if any(float(np.ptp(r.u[r.first_reading :])) > 0.0 or _begins_with_a_step(model, r) for r in recordings):
         return ()
     return tuple(k.name for k in ALL if k.place == "actuator" or k.name == "timing.dead_time" or k.recoordinates)
 

@@ -65,8 +65,9 @@ def cut(recordings: Sequence[Recording], good: Sequence[BoolArray], length_s: fl
     """Return recordings in windows of a length, thinned where they are long, their residuals taken for white."""
     starts, stops = [], []
     for r in recordings:
-        count = max(1, round(r.duration_s / length_s))
-        edges = r.t[0] + r.duration_s / count * np.arange(count)
+        begins = r.t[r.first_reading]
+        count = max(1, round((r.t[-1] - begins) / length_s))
+        edges = begins + (r.t[-1] - begins) / count * np.arange(count)
         first = np.unique(np.searchsorted(r.t, edges - 1e-9)).astype(np.int64)
         starts.append(first)
         stops.append(np.append(first[1:], len(r)).astype(np.int64))

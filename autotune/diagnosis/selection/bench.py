@@ -128,15 +128,15 @@ class Bench:
     def judged(self, result: Fit, log_odds: float) -> JudgedChain | None:
         """Return a fit to long windows, judged; nothing where it runs away, or where an effect stands for another.
 
-        Where it leaves far less than the bench's residual it is fitted again first: priors weighed too much, beside
-        rows that tell more than they were taken to.
+        Where it leaves far less than the residual that it was fitted at, it is fitted again first, and again until it
+        does not: priors weighed too much, beside rows that tell more than they were taken to.
         """
         if is_stand_in(hypothesis(result), self.long):
             return None
-        sd = residual_sd(result, self.long)
-        bench = self if sd > CLOSER * self.long.noise.sd else self._at(sd)
+        bench = self
         try:
-            if bench is not self:
+            while (sd := residual_sd(result, self.long)) < CLOSER * bench.long.noise.sd:
+                bench = self._at(sd)
                 closer = fit(result.parametrisation, bench.long, result.theta, result.x0, iterations=STEPS)
                 result = move_time_of_change(closer, bench.long)
             return bench._judged(result, log_odds)

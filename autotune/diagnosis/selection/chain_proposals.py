@@ -119,9 +119,10 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
 
     def resumed(self, one: JudgedChain) -> JudgedChain | None:
         """Return a hypothesis that was fitted to more rows, fitted to these from its numbers; None if it runs away."""
+        bench = self.in_units_of(one)
         try:
-            there = fit_from(one.fit.parametrisation, self.long, one.fit.theta, iterations=LAST_STEPS)
-            return self.judged(there, one.log_odds)
+            there = fit_from(one.fit.parametrisation, bench.long, one.fit.theta, iterations=LAST_STEPS)
+            return bench.judged(there, one.log_odds)
         except RUNAWAY:
             return None
 

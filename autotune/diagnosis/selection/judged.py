@@ -99,7 +99,7 @@ class Judged(ABC):
 
     @abstractmethod
     def unfelt(self, effects: Sequence[Effect]) -> frozenset[str]:
-        """Return the effects that would change what is read by less than one row of what it leaves."""
+        """Return the effects that would change what is read by less than one row's noise does."""
 
     @property
     @abstractmethod

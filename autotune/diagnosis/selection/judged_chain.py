@@ -101,15 +101,15 @@ class JudgedChain(Judged):
         return replace(self, fit=result, data=data)
 
     def unfelt(self, effects: Sequence[Effect]) -> frozenset[str]:
-        """Return the effects that would change what is read by less than one row's residual does."""
-        names = set()
+        """Return the effects that would change what is read by less than one row's noise does."""
+        names, least = set(), (under_noise(self.fit, self.data).noise.total_sd / self.data.noise.sd) ** 2
         for effect in effects:
             p, theta, states = extend(self.fit, effect, self.data)
             try:
                 change = residual_at(p, self.data, theta, states) - self.fit.e
             except RUNAWAY:
                 continue
-            if float(change @ change) < 1.0:
+            if float(change @ change) < least:
                 names.add(effect.name)
         return frozenset(names)
 

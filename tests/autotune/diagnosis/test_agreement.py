@@ -11,7 +11,13 @@ import numpy as np
 import pytest
 
 from autotune.diagnosis.agreement import LEFT_OUT, Begins, agreement, parts_of, tells
+from autotune.diagnosis.evidence.stretches import rms
+from autotune.diagnosis.fitting.data import as_white
+from autotune.diagnosis.fitting.fit import fit_from
+from autotune.diagnosis.fitting.long_windows import cut
+from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.thresholds import IN_USE
+from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.recording import Recording
 
 Said: TypeAlias = Mapping[str, float]
@@ -31,10 +37,30 @@ def shares(whole: Said, parts: Sequence[Said], begins: Begins = MappingProxyType
 
 def test_each_part_leaves_a_fifth_of_every_recording_out_at_one_of_its_ends() -> None:
     first, last = parts_of((recorded(1000), recorded(500)), 100)
-    assert [len(r) for r in first] == [len(r) for r in last] == [800, 400]
-    assert first[0].y[0] == LEFT_OUT * 1000
+    assert [int(np.isfinite(r.y).sum()) for r in first] == [len(r) for r in last] == [800, 400]
+    assert first[0].y[first[0].first_reading] == LEFT_OUT * 1000
     assert last[0].y[-1] == (1.0 - LEFT_OUT) * 1000 - 1
     assert parts_of((recorded(1000), recorded(120)), 100) == ()
+
+
+def test_what_was_commanded_before_a_part_begins_acts_in_it() -> None:
+    """A play holds where it was pulled to and a dead time what was sent: true numbers leave noise in every part."""
+    rng, rows, sd, width, delay = np.random.default_rng(5), 600, 0.01, 1.0, 25
+    u = np.cumsum(0.15 * rng.normal(size=rows) * (np.arange(rows) > 50))
+    held, y, state = np.zeros(rows), np.zeros(rows), 0.0
+    for k in range(1, rows):
+        held[k] = min(max(held[k - 1], u[k] - width / 2.0), u[k] + width / 2.0)
+        state += (1.0 - math.exp(-0.1)) * (held[max(k - 1 - delay, 0)] - state)
+        y[k] = state
+    recording = Recording(t=np.arange(float(rows)), u=u, y=y + sd * rng.normal(size=rows))
+    dynamics = TransferFunction(num=(1.0,), den=(10.0, 1.0), delay_s=float(delay))
+    model = Model(name="loop", input=Port(), output=Port(), blocks=(Block(name="p", place="plant", dynamics=dynamics),))
+    play = Effect(name="actuator.backlash", parameters={"width": Parameter(value=width)})
+    p = parametrise(model, [play], float(np.std(u)), 1.0, IN_USE.prior_spread)
+    for part in parts_of((recording,), 100):
+        data = cut(part, [np.isfinite(r.y) for r in part], 600.0, IN_USE)
+        there = fit_from(p, as_white(data, sd), p.centre, iterations=0, rounds=2)
+        assert rms(there.residuals, data.good) < 1.1 * sd
 
 
 def test_what_is_likelier_than_not_is_named_and_what_a_part_contradicts_is_not() -> None:
