@@ -28,9 +28,25 @@ class LimitSettings(Section):
     u_max: Annotated[Number, Field(description="highest command [u unit]")]
     u_safe: Annotated[Number, Field(description="command the rig is left with [u unit], within u_min..u_max")]
     u_rate: Annotated[Number, Field(gt=0, description="largest change of the command per second [u unit/s]")] = 1e9
-    y_min: Annotated[Number, Field(description="lowest measurement the experiment may see once it floats [y unit]")]
-    y_max: Annotated[Number, Field(description="highest measurement the experiment may see once it floats [y unit]")]
-    swing: Annotated[Number, Field(gt=0, description="largest departure of y from the operating point [y unit]")]
+    y_min: Annotated[
+        Number,
+        Field(
+            description="lowest measurement the experiment may see [y unit]; a rig that begins below it may go half a"
+            " swing lower until it is brought to its operating point"
+        ),
+    ]
+    y_max: Annotated[
+        Number, Field(description="highest measurement the experiment may see [y unit]; of a start beyond it as y_min")
+    ]
+    swing: Annotated[
+        Number,
+        Field(
+            gt=0,
+            description="largest departure of y from the operating point [y unit], in every state; a rig that begins"
+            " further away may go half a swing beyond where it began until it is brought there. Judged by the median of"
+            " five readings, beside the noise; what the rig does after the safe command is beyond it",
+        ),
+    ]
     time_s: Annotated[Time, Field(description="longest time on the rig [s]")] = 600.0
     late_s: Annotated[
         float,
@@ -67,7 +83,10 @@ class OperatingPointSettings(Section):
     u_uncertainty: Annotated[Number, Field(gt=0, description="how far the true one may be from u_guess [u unit]")]
     approach: Annotated[
         Literal["ramp", "hold"],
-        Field(description="ramp the command until y moves, or start where the rig is"),
+        Field(
+            description="ramp the command until y moves; or start where the rig is, under the command that it says it"
+            " applies where y is near the operating point, else under u_guess"
+        ),
     ] = "ramp"
     plant_sign: Annotated[
         int, Field(ge=-1, le=1, description="sign of the plant's gain, -1 or 1; 0 to have it measured")

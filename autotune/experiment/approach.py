@@ -16,15 +16,13 @@ from autotune.experiment.local_model import lag_beyond_integrator
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.oscillation import Oscillation, mean_command, noise_half, too_noisy
 from autotune.experiment.plant_sign import find_sign
-from autotune.experiment.preflight import SMALL, Known, Tell
+from autotune.experiment.preflight import BRACKET, SMALL, Known, Tell
 from autotune.experiment.relay import RelaySettings
 from autotune.identification.envelope import polar_sd
 from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
 
 #: smoothing of the relay while nothing is known of the plant
 FIRST_SMOOTHING = 5
-#: how far below the lower end of the hover's bracket the ramp starts, and above the upper it ends, in u_uncertainty
-BRACKET = 1.2
 #: samples in which a ramp goes through one u_uncertainty, and the sample time [s] below which a host ramps no faster
 RAMP_SAMPLES, RAMP_SAMPLE_S = 600.0, 0.01
 #: part of limits.swing that y moves by, beside the noise, before the plant counts as moving
@@ -60,8 +58,7 @@ def approach(
         if u_rest is not None:
             bracket = (max(bracket[0], u_rest - 0.25 * reach), bracket[1])
         return _ramp(loop, point, known, tell, bracket)
-    u_guess = u_rest if u_rest is not None else point.u_guess
-    known = replace(known, midpoint=u_guess, y_moved=point.y)
+    known = replace(known, midpoint=u_rest if u_rest is not None else known.u_held, y_moved=point.y)
     known = replace(known, first_move_s=loop.tick.t_s)
     return known if known.plant_sign != 0 else find_sign(loop, point, known, tell)
 
@@ -98,6 +95,7 @@ def _ramp(
         known,
         plant_sign=sign,
         sign_seen=True,
+        midpoint_seen=True,
         midpoint=loop.tick.u - rate * since,
         first_move_s=loop.tick.t_s - since,
         y_moved=known.y_rest + moved,
@@ -176,13 +174,13 @@ def find_midpoint(
 
 def _where_relay_begins(loop: ControlLoop, point: OperatingPointSettings, known: Known) -> tuple[float, float]:
     """Return the first mid-point and how far the relay reaches to either side of it [u unit]."""
-    if not known.sign_seen:
+    if not known.midpoint_seen:
         return known.midpoint, BRACKET * point.u_uncertainty
     # where ramp or pushes have told the mid-point roughly, the relay need not reach across all of its uncertainty
-    reach, aside = 0.4 * point.u_uncertainty, known.midpoint - point.u_guess
+    reach, aside = 0.4 * point.u_uncertainty, known.midpoint - known.u_held
     if point.approach == "hold" and known.plant_sign * aside * (loop.tick.y - point.y) > 0.0:
-        # y is where u_guess is too much if anything, and the pushes asked for more: they were seen from y's way back,
-        # on which it does not stand still at the command that holds the operating point. The relay reaches both.
+        # y is where what was held is too much if anything, and the pushes asked for more: they were seen from y's way
+        # back, on which it does not stand still at the command that holds the operating point. The relay reaches both.
         return known.midpoint - 0.5 * aside, reach + 0.5 * abs(aside)
     return known.midpoint, reach
 

@@ -11,6 +11,8 @@ from autotune.errors import ExperimentStopped
 
 #: relative slack of the rate check: a command on the border of what is allowed is allowed in spite of rounding
 RATE_SLACK = 1e-9
+#: part of limits.swing by which y may go beyond where it started, on its way to the operating point from further off
+START_ROOM = 0.5
 #: samples without a usable reading that are ridden through where no time is given
 BLIND_SAMPLES = 5
 
@@ -22,13 +24,39 @@ class Watch:
     Attributes
     ----------
     y_centre : float or None
-        Operating point that the swing is counted from [y unit]; None while the rig is on its way to it.
+        Operating point that the swing is counted from [y unit]; None where it does not apply.
     in_range : bool
         Whether y_min and y_max apply.
+    y_start : float or None
+        Where y was when the way to the operating point began [y unit]; None where y is there. A rig that begins beyond
+        a limit is given room there, see :meth:`reach` and :meth:`range`.
     """
 
     y_centre: float | None = None
     in_range: bool = False
+    y_start: float | None = None
+
+    def reach(self, swing: float) -> float:
+        """Return how far y may be from the operating point [y unit]: the swing, or START_ROOM beyond where it began.
+
+        Parameters
+        ----------
+        swing : float
+            ``limits.swing`` [y unit].
+        """
+        if self.y_start is None or self.y_centre is None:
+            return swing
+        return max(swing, abs(self.y_start - self.y_centre) + START_ROOM * swing)
+
+    def range(self, limits: LimitSettings) -> tuple[float, float]:
+        """Return y_min and y_max [y unit], or on the way START_ROOM beyond a start that is not between them."""
+        low, high, room = limits.y_min, limits.y_max, START_ROOM * limits.swing
+        if self.y_start is None:
+            return low, high
+        return (
+            low if self.y_start >= low else self.y_start - room,
+            high if self.y_start <= high else self.y_start + room,
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,17 +192,26 @@ class Envelope:
         y = median(recent)
         limits = self.settings
         slack = noise if len(recent) > 1 else 0.0
-        if watch.in_range and not limits.y_min - slack <= y <= limits.y_max + slack:
+        low, high = watch.range(limits)
+        if watch.in_range and not low - slack <= y <= high + slack:
             raise ExperimentStopped(
                 f"limit reached: y = {y:.4g} is outside y_min..y_max = {limits.y_min:g}..{limits.y_max:g}",
                 remedy="look for a load on the rig, or widen limits.y_min..y_max if the rig stands it",
             )
-        if watch.y_centre is not None and abs(y - watch.y_centre) > limits.swing + slack:
+        if watch.y_centre is None or abs(y - watch.y_centre) <= watch.reach(limits.swing) + slack:
+            return
+        if watch.y_start is None:
             raise ExperimentStopped(
                 f"limit reached: y = {y:.4g} is more than limits.swing = {limits.swing:g}"
                 f" from the operating point {watch.y_centre:g}",
                 remedy="ask for a smaller relay_amplitude, or allow more swing",
             )
+        raise ExperimentStopped(
+            f"limit reached: y = {y:.4g} left limits.swing = {limits.swing:g} around the operating point"
+            f" {watch.y_centre:g} while the way to it was sought from {watch.y_start:.4g}",
+            remedy="correct operating_point.u_guess; give less u_uncertainty, which the command is moved by; or allow"
+            " more swing",
+        )
 
     def check_time(self, elapsed_s: float) -> None:
         """Stop the experiment when its time is over.

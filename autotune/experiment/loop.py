@@ -200,6 +200,11 @@ class ControlLoop:
         return self.tick
 
     @property
+    def shows_applied(self) -> bool:
+        """Whether the device said what it applied when the latest sample was taken."""
+        return math.isfinite(self._reading.u_applied)
+
+    @property
     def applied(self) -> float:
         """Output that the device applied when the latest sample was taken; the command where it does not say."""
         shown = self._reading.u_applied

@@ -12,6 +12,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.config.procedure import OperatingPointSettings
 from autotune.errors import ExperimentStopped, LinkError
+from autotune.experiment.limits import START_ROOM, Watch
 from autotune.experiment.loop import ControlLoop, Timing
 from autotune.experiment.monitor import RECENT
 from autotune.experiment.rig import Exchanges, RunsRelay
@@ -22,6 +23,8 @@ PREFLIGHT_SAMPLES = 60
 SLOW_SHARE = 0.05
 #: least share of readings in preflight that differ from the one before, for a sensor of which that can be expected
 RESTLESS = 0.05
+#: how far from u_guess the command that holds the operating point is looked for, in u_uncertainty
+BRACKET = 1.2
 SMALL = 1e-9
 #: samples per period that an estimate needs at least
 LEAST_SAMPLES = 8
@@ -43,10 +46,12 @@ class Known:
         Standard deviation and half-width of the measurement noise [y unit].
     y_rest : float
         Mean measurement in preflight [y unit].
+    u_held : float
+        Command that was held meanwhile [u unit].
     plant_sign : int
         Sign of the plant's gain, 0 while unknown.
-    sign_seen : bool
-        Whether that was seen on the rig, and the mid-point roughly with it, and not only said.
+    sign_seen, midpoint_seen : bool
+        Whether sign and mid-point, this one roughly, were seen on the rig and not only said.
     midpoint : float
         Command that holds the plant, as far as known [u unit].
     first_move_s : float
@@ -66,8 +71,10 @@ class Known:
     noise_sd: float = 0.0
     noise_half: float = 0.0
     y_rest: float = math.nan
+    u_held: float = math.nan
     plant_sign: int = 0
     sign_seen: bool = False
+    midpoint_seen: bool = False
     midpoint: float = math.nan
     first_move_s: float = 0.0
     y_moved: float = math.nan
@@ -94,11 +101,13 @@ def preflight(loop: ControlLoop, point: OperatingPointSettings, gain_sd: float, 
         Link too slow, sensor at its rail or frozen.
     """
     tell("looking at link and noise")
-    start_u = point.u_guess if point.approach == "hold" else loop.tick.u
+    start_u = _command_to_hold(loop, point) if point.approach == "hold" else loop.tick.u
     first_row = loop.tick.k
     first: tuple[float, ...] = ()
     for _ in range(PREFLIGHT_SAMPLES):
         loop.step(loop.nearest(start_u))
+        if len(first) < RECENT <= len(loop.monitor.recent):
+            loop.watch = Watch(y_centre=point.y, in_range=True, y_start=median(loop.monitor.recent))
         first = first if len(first) == RECENT else loop.monitor.recent
         if point.approach == "ramp":
             _check_at_rest(loop, first_row, first)
@@ -146,9 +155,22 @@ def preflight(loop: ControlLoop, point: OperatingPointSettings, gain_sd: float, 
         noise_sd=noise_sd,
         noise_half=noise_half,
         y_rest=float(np.mean(y)),
+        u_held=start_u,
         plant_sign=point.plant_sign,
         link_rad_s=link_rad_s,
     )
+
+
+def _command_to_hold(loop: ControlLoop, point: OperatingPointSettings) -> float:
+    """Return the command under which the rig is looked at where it is [u unit].
+
+    What the rig says it applies, where y is near the operating point under it and u_guess allows it: nothing has to
+    move. Else u_guess.
+    """
+    applied = loop.applied
+    is_there = abs(loop.tick.y - point.y) <= START_ROOM * loop.envelope.settings.swing
+    is_said = loop.shows_applied and abs(applied - point.u_guess) <= BRACKET * point.u_uncertainty
+    return applied if is_there and is_said else point.u_guess
 
 
 def _check_at_rest(loop: ControlLoop, first_row: int, first: tuple[float, ...]) -> None:

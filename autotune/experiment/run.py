@@ -244,7 +244,7 @@ def bring_to_operating_point(
     point, wanted = config.operating_point, config.experiment
     known = preflight(loop, point, wanted.gain_sd, silent)
     if plant_sign and u_rest is not None:
-        known = replace(known, plant_sign=plant_sign, sign_seen=True)
+        known = replace(known, plant_sign=plant_sign, sign_seen=True, midpoint_seen=True)
     known = approach(loop, point, known, silent, u_rest=u_rest)
     known, _ = find_midpoint(loop, point, wanted.relay_amplitude, known, silent)
     return known
