@@ -134,19 +134,43 @@ def export(
     from autotune.equations.typeset import as_latex
 
     place = Output(out, inputs=(model,), overwrite=overwrite)
+    if form == "fmu" and (chain := _chain_with_effects(model)) is not None:
+        _export_chain(chain, place)
+        return
     equations = _equations(model)
     if form == "toml":
         _write(flatten(equations), place)
         return
     if form == "fmu":
         content, library = as_fmu(equations)
-        place.by(lambda part: part.write_bytes(content))
-        built = f"a library for {library}" if library else "no library, as there is no C compiler"
-        typer.echo(f"wrote {out}: FMI 3.0 for co-simulation, its C source and {built}")
+        _write_fmu(content, library, place)
         return
     text = {"text": as_text, "latex": as_latex, "modelica": as_modelica, "python": as_python}[form](equations)
     place.text(text)
     typer.echo(f"wrote {out}")
+
+
+def _write_fmu(content: bytes, library: str, place: Output) -> None:
+    place.by(lambda part: Path(part).write_bytes(content))
+    built = f"a library for {library}" if library else "no library, as there is no C compiler"
+    typer.echo(f"wrote {place.path}: FMI 3.0 for co-simulation, its C source and {built}")
+
+
+def _chain_with_effects(path: Path) -> Model | None:
+    from autotune.model_file import read_any as read_any_model
+    from autotune.models import Model
+
+    found = read_any_model(path)
+    return found if isinstance(found, Model) and found.effects else None
+
+
+def _export_chain(chain: Model, place: Output) -> None:
+    """Write a chain with its effects as an FMU, and say which of them no simulation has."""
+    from autotune.diagnosis.simulation.chain_fmu import chain_as_fmu, left_out_of_fmu
+
+    _write_fmu(*chain_as_fmu(chain), place)
+    if missing := left_out_of_fmu(chain):
+        typer.echo(f"left out, as in every simulation: {', '.join(missing)}")
 
 
 @model_app.command("linearise", context_settings={"ignore_unknown_options": True})

@@ -8,6 +8,8 @@ import shutil
 import subprocess
 import tempfile
 import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -35,10 +37,71 @@ _C_WORDS = (
 _C_TAKEN = frozenset(_C_WORDS.split())
 
 
-def as_c(model: EquationModel) -> str:
-    """Return the C source of an FMU: the model's equations, and the functions by which FMI 3.0 runs them."""
-    flat = flatten(model)
-    names = safe_names(flat, _C_TAKEN)
+@dataclass(frozen=True, kw_only=True)
+class Variable:
+    """A quantity of an FMU: its name, its unit as people write it, and what it begins with."""
+
+    name: str
+    unit: str
+    start: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description:
+    """What an FMU has, in the order of its value references: inputs, states, y, parameters.
+
+    Attributes
+    ----------
+    name : str
+        Of the model.
+    inputs, states, parameters : tuple of Variable
+        Held between communication points; set before a run; tunable.
+    output_unit : str
+        Unit of y.
+    """
+
+    name: str
+    inputs: tuple[Variable, ...]
+    states: tuple[Variable, ...]
+    output_unit: str
+    parameters: tuple[Variable, ...]
+
+    def to_xml(self, token: str) -> str:
+        """Return modelDescription.xml, with the token that the library expects."""
+        held, exact = 'causality="input"', 'causality="local" initial="exact"'
+        tunable = 'causality="parameter" variability="tunable"'
+        lines = ['<Float64 name="time" valueReference="0" causality="independent"/>']
+
+        def add(name: str, unit: str, says: str) -> None:
+            described = f" description={quoteattr(f'[{unit}]')}" if unit else ""
+            lines.append(f'<Float64 name={quoteattr(name)} valueReference="{len(lines)}" {says}{described}/>')
+
+        def begun(one: Variable) -> str:
+            return f'start="{one.start!r}"'.replace("inf", "INF")  # as XML Schema writes it
+
+        for one in self.inputs:
+            add(one.name, one.unit, f"{held} {begun(one)}")
+        for one in self.states:
+            add(one.name, one.unit, f"{exact} {begun(one)}")
+        y = len(lines)
+        add("y", self.output_unit, 'causality="output" initial="calculated"')
+        for one in self.parameters:
+            add(one.name, one.unit, f"{tunable} {begun(one)}")
+        variables = "\n    ".join(lines)
+        return f"""<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="3.0" modelName={quoteattr(self.name)} instantiationToken="{token}"
+  generationTool="relay-autotune">
+  <CoSimulation modelIdentifier="{_IDENTIFIER}" canHandleVariableCommunicationStepSize="true"/>
+  <ModelVariables>
+    {variables}
+  </ModelVariables>
+  <ModelStructure><Output valueReference="{y}"/><InitialUnknown valueReference="{y}"/></ModelStructure>
+</fmiModelDescription>
+"""
+
+
+def _equations_in_c(flat: EquationModel, names: Mapping[str, str]) -> str:
+    """Return the equations of a model without effects, and what runs them between communication points."""
 
     def numbers(values: list[float]) -> str:
         return "{" + ", ".join(repr(float(value)) for value in (*values, 0.0)) + "}"
@@ -61,54 +124,18 @@ def as_c(model: EquationModel) -> str:
         *(f"    dx[{i}] = {_C.spell(one.derivative, names)};" for i, one in enumerate(flat.states)), "}", "",
         f"static double output({given})", "{", *unpacked, f"    return {_C.spell(flat.output, names)};", "}", "",
     ]  # fmt: skip
-    body = "\n".join(equations) + Path(__file__).with_name("fmi3.c").read_text(encoding="utf-8")
-    return f'#include <math.h>\n#define TOKEN "{_token(body)}"\n{body}'
+    return "\n".join(equations) + _part("fmi3_equations.c")
 
 
-def _token(body: str) -> str:
-    """Return what tells this FMU from any other: the same for the same equations."""
-    return sha256(body.encode()).hexdigest()[:32]
+def _part(name: str) -> str:
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
-def description_of(model: EquationModel, token: str) -> str:
-    """Return modelDescription.xml.
-
-    Parameters
-    ----------
-    model : EquationModel
-        With its effects.
-    token : str
-        That the library expects.
-    """
-    flat = flatten(model)
-    names = safe_names(flat, _C_TAKEN)
-    held, exact = 'causality="input"', 'causality="local" initial="exact"'
-    tunable = 'causality="parameter" variability="tunable"'
-    lines = ['<Float64 name="time" valueReference="0" causality="independent"/>']
-
-    def add(name: str, unit: str, says: str) -> None:
-        described = f" description={quoteattr(f'[{unit}]')}" if unit else ""
-        lines.append(f'<Float64 name={quoteattr(name)} valueReference="{len(lines)}" {says}{described}/>')
-
-    for one in flat.inputs:
-        add(names[one.column], one.unit, f'{held} start="0.0"')
-    for state in flat.states:
-        add(names[state.name], state.unit, f'{exact} start="{state.start or 0.0!r}"')
-    y = len(lines)
-    add("y", flat.output_unit, 'causality="output" initial="calculated"')
-    for known in flat.parameters:
-        add(names[known.name], known.unit, f'{tunable} start="{known.value!r}"')
-    variables = "\n    ".join(lines)
-    return f"""<?xml version="1.0" encoding="UTF-8"?>
-<fmiModelDescription fmiVersion="3.0" modelName={quoteattr(flat.name)} instantiationToken="{token}"
-  generationTool="relay-autotune">
-  <CoSimulation modelIdentifier="{_IDENTIFIER}" canHandleVariableCommunicationStepSize="true"/>
-  <ModelVariables>
-    {variables}
-  </ModelVariables>
-  <ModelStructure><Output valueReference="{y}"/><InitialUnknown valueReference="{y}"/></ModelStructure>
-</fmiModelDescription>
-"""
+def whole_source(model: str) -> str:
+    """Return the C source of an FMU from that of its model, with the functions by which FMI 3.0 runs it around it."""
+    body = f"{_part('fmi3_types.c')}\n{model}\n{_part('fmi3.c')}"
+    # the token tells this FMU from any other: the same for the same equations
+    return f'#define TOKEN "{sha256(body.encode()).hexdigest()[:32]}"\n{body}'
 
 
 _BUILD = f"""<?xml version="1.0" encoding="UTF-8"?>
@@ -138,12 +165,33 @@ def as_fmu(model: EquationModel) -> tuple[bytes, str]:
     ----------
     Modelica Association, Functional Mock-up Interface Specification 3.0, 2022, sections 2.4, 2.5 and 4.
     """
-    source = as_c(model)
+    flat = flatten(model)
+    names = safe_names(flat, _C_TAKEN)
+    description = Description(
+        name=flat.name,
+        inputs=tuple(Variable(name=names[one.column], unit=one.unit, start=0.0) for one in flat.inputs),
+        states=tuple(Variable(name=names[one.name], unit=one.unit, start=one.start or 0.0) for one in flat.states),
+        output_unit=flat.output_unit,
+        parameters=tuple(Variable(name=names[one.name], unit=one.unit, start=one.value) for one in flat.parameters),
+    )
+    return pack_fmu(whole_source(_equations_in_c(flat, names)), description)
+
+
+def pack_fmu(source: str, description: Description) -> tuple[bytes, str]:
+    """Return an FMU of C source, and the platform that it brings a library for; empty without a C compiler.
+
+    Parameters
+    ----------
+    source : str
+        Of :func:`whole_source`.
+    description : Description
+        What it has.
+    """
     token = source.split('"', 2)[1]
     library, tuple_of_platform, suffix = _compiled(source)
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("modelDescription.xml", description_of(model, token))
+        archive.writestr("modelDescription.xml", description.to_xml(token))
         archive.writestr("sources/buildDescription.xml", _BUILD)
         archive.writestr(f"sources/{_IDENTIFIER}.c", source)
         if library:

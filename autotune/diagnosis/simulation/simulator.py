@@ -21,7 +21,7 @@ from autotune.recording import Recording
 
 #: Sub-steps of a sample at most, of one whose command runs straight between rows, and the largest sub-step of a forced
 #: plant in units of its fastest time constant.
-_MOST, _LINEAR, _FASTEST = 8, 4, 0.2
+MOST_PIECES, _LINEAR, FASTEST = 8, 4, 0.2
 #: 0 degrees Celsius [K].
 ICE_K = 273.15
 
@@ -127,13 +127,13 @@ class Simulator:
 
     def step_s(self, dt_s: float) -> float:
         """Return the longest sub-step [s] for a sample time: shorter where forces change within a sample."""
-        pieces, is_forced = self._pieces
+        pieces, is_forced = self.pieces
         if is_forced:
-            pieces = max(pieces, math.ceil(self.chain.fastest_of_plant * dt_s / _FASTEST))
-        return dt_s / min(pieces, _MOST)
+            pieces = max(pieces, math.ceil(self.chain.fastest_of_plant * dt_s / FASTEST))
+        return dt_s / min(pieces, MOST_PIECES)
 
     @cached_property
-    def _pieces(self) -> tuple[int, bool]:
+    def pieces(self) -> tuple[int, bool]:
         """Sub-steps of a sample at least, whatever its length, and whether forces ask for more."""
         least = max(_LINEAR if self.linear_hold else 1, *(kind.sub_steps for kind in self.kinds), 1)
         return least, any(_acts_at(kind, *_FORCED) for kind in self.kinds)
@@ -176,7 +176,7 @@ class Simulator:
         chain, (rows, count) = self.chain, _rows(windows, len(recording))
         states = np.empty((2, rows.shape[1], chain.order))
         states[0] = x0
-        numbers, flags = self._numbers.copy(), self._flags.copy()
+        numbers, flags = self.numbers.copy(), self.flags.copy()
         numbers[kernel.STEP] = step
         flags[kernel.NUMBER], flags[kernel.SIGNALS_ASKED], flags[kernel.ROWS] = number, signals, count
         out = self.compiled(
@@ -185,13 +185,13 @@ class Simulator:
         return out.T, states[1]
 
     @cached_property
-    def _numbers(self) -> FloatArray:
+    def numbers(self) -> FloatArray:
         """What the compiled simulation is told in numbers; the step is filled in by each run."""
         place = (0.0, self.chain.delay_s, self.u_offset, self.y_offset, self.kelvin, float(self.chain.is_static))
         return np.concatenate([place, self.chain.gains, self.values])
 
     @cached_property
-    def _flags(self) -> IntArray:
+    def flags(self) -> IntArray:
         """What it may leave out, see the positions in its body; each run fills in number, signals and rows."""
         directional = self.falling is not self.chain
         forced = any(_acts_at(kind, *_FORCED) for kind in self.kinds)
