@@ -13,7 +13,7 @@ from autotune.cli import app
 from autotune.cli.common import OVERWRITE
 from autotune.cli.init_keys import REGISTER, Table, add_registers, set_keys
 from autotune.cli.init_model import EXAMPLE, ModelOfRig, model_of_rig
-from autotune.cli.init_questions import Questions, one_of
+from autotune.cli.init_questions import Questions, number_of_option, one_of
 from autotune.cli.init_rig import ask_rig, ask_signals, config_of, round_to_two
 from autotune.cli.init_text import text_of
 from autotune.errors import InputError
@@ -123,16 +123,26 @@ def init(
     u_span: Annotated[
         tuple[float, float] | None, typer.Option(help="u at count 0 and at full scale of a microcontroller [u unit]")
     ] = None,
-    sample_time: Annotated[float | None, typer.Option(help="control period [s]")] = None,
+    sample_time: Annotated[
+        float | None, typer.Option(parser=number_of_option, metavar="NUMBER", help="control period [s]")
+    ] = None,
     u_unit: Annotated[str | None, typer.Option(help="unit of the command")] = None,
     y_unit: Annotated[str | None, typer.Option(help="unit of the measurement")] = None,
     u_range: Annotated[tuple[float, float] | None, typer.Option(help="lowest and highest command [u unit]")] = None,
-    u_safe: Annotated[float | None, typer.Option(help="command the rig may be left with [u unit]")] = None,
+    u_safe: Annotated[
+        float | None,
+        typer.Option(parser=number_of_option, metavar="NUMBER", help="command the rig may be left with [u unit]"),
+    ] = None,
     y_range: Annotated[
         tuple[float, float] | None, typer.Option(help="lowest and highest y of the experiment [y unit]")
     ] = None,
-    y: Annotated[float | None, typer.Option(help="y of the operating point [y unit]")] = None,
-    u: Annotated[float | None, typer.Option(help="command that holds y there, about [u unit]")] = None,
+    y: Annotated[
+        float | None, typer.Option(parser=number_of_option, metavar="NUMBER", help="y of the operating point [y unit]")
+    ] = None,
+    u: Annotated[
+        float | None,
+        typer.Option(parser=number_of_option, metavar="NUMBER", help="command that holds y there, about [u unit]"),
+    ] = None,
 ) -> None:
     """Write a commented configuration; asks at a terminal for what no flag says."""
     from autotune.config import Config, validate

@@ -104,8 +104,10 @@ def one_of(answer: str, known: Collection[str], flag: str) -> str:
 
 
 def pair(answer: str) -> tuple[float, float]:
-    """Return the two numbers of an answer."""
+    """Return the two numbers of an answer: 0 100 or 0,100; between blanks or semicolons with decimal commas too."""
     parts = answer.replace(",", " ").split()
+    if len(parts) != 2:
+        parts = answer.replace(";", " ").split()
     if len(parts) != 2:
         raise InputError(f"{answer!r}: two numbers are wanted, such as 0 100", where="autotune init")
     return number(parts[0]), number(parts[1])
@@ -120,11 +122,24 @@ def limits(answer: str) -> tuple[float, float]:
 
 
 def number(answer: str) -> float:
-    """Return the number of an answer."""
+    """Return the number of an answer; a decimal comma is taken for a point, and it is said that it was."""
+    text = answer.strip()
+    with_point = text.replace(",", ".") if text.count(",") == 1 and "." not in text else text
     try:
-        return float(answer)
+        value = float(with_point)
     except ValueError:
         raise InputError(f"{answer!r} is no number, such as 0.1", where="autotune init") from None
+    if with_point != text:
+        typer.echo(f"{text} is read as {value:g}")
+    return value
+
+
+def number_of_option(answer: str) -> float:
+    """Return the number of an option; refused as any other option is."""
+    try:
+        return number(answer)
+    except InputError as error:
+        raise typer.BadParameter(error.what) from None
 
 
 def number_within(limits: tuple[float, float] | None) -> Callable[[str], float]:

@@ -24,6 +24,8 @@ from autotune.points import FrequencyPoint
 
 #: lags in the structures that are tried, beside the integrator and the dead time
 _MAX_LAGS = 2
+#: points that a fit of the plant takes at least
+LEAST_POINTS = 3
 #: a structure whose Bayesian criterion is higher than the best one's by more is excluded by the data: odds of 20 to 1
 EXCLUDED = 2.0 * math.log(20.0)
 #: what a standard deviation may raise the sum of squares by where 1 is its rise to first order, and how often the
@@ -166,9 +168,13 @@ def fit_plant(points: Sequence[FrequencyPoint]) -> PlantFit:
     The structure holds between and near the points; far outside them it is an extrapolation. It has no resonance and
     no zeros.
     """
-    if len(points) < 3:
+    if len(points) < LEAST_POINTS:
+        there_is = {0: "there is none", 1: "there is one"}.get(len(points), "there are two")
         raise IdentificationError(
-            f"{len(points)} frequency point(s)", where="fit of the plant", remedy="measure at least three frequencies"
+            f"a plant takes three frequency points, and {there_is}",
+            where="fit of the plant",
+            remedy="move the command up and down, slowly and fast, while it is recorded; or let a relay measure points"
+            " (autotune run)",
         )
     return not_excluded(fit_structures(points))
 

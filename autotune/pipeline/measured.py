@@ -13,7 +13,7 @@ from autotune.identification.dependence import require_answer
 from autotune.identification.frequency.recorded import combine, session_points, sessions
 from autotune.identification.frequency.spectral_points import FrequencyEstimate
 from autotune.identification.frequency.windows import read_noted_windows
-from autotune.identification.parametric import PlantFit
+from autotune.identification.parametric import LEAST_POINTS, PlantFit
 from autotune.identification.recorded_plant import fit_recordings
 from autotune.pipeline.one_thread import on_one_thread
 from autotune.points import FrequencyPoint
@@ -22,8 +22,6 @@ from autotune.recording import Recording
 
 #: recordings whose points say less than a fit of the whole record does; a relay's say more
 _PLAIN = ("random or steps", "repeated command", "closed loop by way of r")
-#: a plant is fitted to so many points at least
-_LEAST_POINTS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +82,7 @@ def measure_plant(
             notes.append(f"no frequency points: {error}")
     combined = combine(estimates) if estimates else None
     fit = combined.fit if combined is not None and not given else None
-    few = fit is None and combined is not None and len(combined.points) < _LEAST_POINTS
+    few = fit is None and combined is not None and len(combined.points) < LEAST_POINTS
     if recordings and not given and (few or all(one.excitation in _PLAIN for one in estimates)):
         try:
             by_way_of_r = [one for one in combined.points if one.source == "closed loop"] if combined else []
@@ -93,7 +91,7 @@ def measure_plant(
             notes.append(str(error))
             reason = reason or error
     points = (*(combined.points if combined else ()), *given)
-    if fit is None and len(points) < _LEAST_POINTS and reason is not None:
+    if fit is None and len(points) < LEAST_POINTS and reason is not None:
         raise reason
     return Measured(
         points=points, fit=fit, facts=_facts(recordings), notes=(*notes, *(combined.notes if combined else ()))

@@ -16,6 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 from autotune.cli import app
+from autotune.cli.init_questions import number
 from autotune.config import load_config
 from autotune.config.registers import RegisterMap
 from autotune.config.rig import ModbusTcpSettings, SerialSettings, SimulatedRigSettings
@@ -393,3 +394,23 @@ def test_a_run_hands_nothing_over_where_a_second_person_is_asked_for(tmp_path: P
     assert "not handed over: [approval] asks for a second person: autotune deploy" in said
     assert (tmp_path / "out" / "journal.jsonl").read_text().count("gains") == 1  # read, and nothing written
     assert not (tmp_path / "out" / "audit.jsonl").exists()
+
+
+def test_a_decimal_comma_is_taken_where_one_number_is_asked_and_said(tmp_path: Path) -> None:
+    """The comma of a pair parts its numbers; between blanks each may have a decimal comma of its own."""
+    answers = "simulated\nK=2 T=10 L=1\n%\ndegC\n0,5\n0,100\n1,25\n20,5 80\n\n30\n"
+    said, status = typed(["init", "oven.toml"], answers, tmp_path)
+    assert status == 0, said
+    assert re.findall(r"\S+ is read as \S+", said) == [
+        "0,5 is read as 0.5", "1,25 is read as 1.25", "20,5 is read as 20.5"
+    ]  # fmt: skip
+    content = load_config(tmp_path / "oven.toml")
+    assert content.signals.sample_time_s == 0.5
+    assert (content.limits.u_min, content.limits.u_max, content.limits.u_safe) == (0.0, 100.0, 1.25)
+    assert (content.limits.y_min, content.limits.y_max) == (20.5, 80.0)
+
+
+@pytest.mark.parametrize("answer", ["1.234,5", "1,234,5", "0,5,", "half"])
+def test_what_may_be_two_numbers_is_none(answer: str) -> None:
+    with pytest.raises(InputError, match="is no number"):
+        number(answer)
