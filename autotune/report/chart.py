@@ -13,10 +13,14 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from autotune.arrays import FloatArray
+
 Trace: TypeAlias = dict[str, Any]
 
 #: What plotly writes with an underscore for a setting inside a group.
 _GROUPS = ("line", "marker", "title", "font")
+#: decades up to which 2 and 5 have a tick as well, and powers of ten that an axis has numbers for at most
+_DIGITS_SHOWN, _MOST_DECADES = 3.0, 8.0
 _DIGITS = 7
 
 
@@ -194,7 +198,27 @@ class Chart:
 
     def to_json(self) -> str:
         """Return traces and layout as JSON, numbers to seven digits, no number as null."""
-        return json.dumps({"data": _plain(self.data), "layout": _plain(self.layout)}, separators=(",", ":"))
+        layout = {key: self._with_ticks(key, value) for key, value in self.layout.items()}
+        return json.dumps({"data": _plain(self.data), "layout": _plain(layout)}, separators=(",", ":"))
+
+    def _with_ticks(self, key: str, axis: Any) -> Any:
+        """Return a logarithmic axis with numbers of one size at its ticks: plotly's own between decades are tiny."""
+        if not isinstance(axis, dict) or axis.get("type") != "log" or "tickvals" in axis:
+            return axis
+        letter, shares = (
+            key[0],
+            "matches" in axis
+            or any(
+                isinstance(one, dict) and one.get("matches") == key.replace("axis", "") for one in self.layout.values()
+            ),
+        )
+        drawn = [
+            np.asarray(trace[letter], dtype=np.float64)
+            for trace in self.data
+            if letter in trace and (shares or trace.get(f"{letter}axis", letter) == key.replace("axis", ""))
+        ]
+        values, texts = log_ticks(drawn)
+        return {**axis, "tickvals": values, "ticktext": texts}
 
     def _name(self, row: int, col: int) -> str:
         return _suffix((row - 1) * self.cols + col - 1)
@@ -204,6 +228,33 @@ class Chart:
             if row in (None, i // self.cols + 1) and col in (None, i % self.cols + 1):
                 own = self.layout.setdefault(f"{axis}{_suffix(i)}", {})
                 own |= _nest(settings)
+
+
+def log_ticks(drawn: Sequence[FloatArray]) -> tuple[list[float], list[str]]:
+    """Return the ticks of a logarithmic axis and their numbers: 1, 2, 5 up to three decades, then powers of ten.
+
+    Parameters
+    ----------
+    drawn : sequence of (N,) array
+        What is drawn along the axis, in any unit.
+    """
+    values = np.concatenate([*drawn, np.empty(0)])
+    values = values[np.isfinite(values) & (values > 0.0)]
+    if not values.size:
+        return [], []
+    low, high = math.floor(math.log10(values.min())), math.ceil(math.log10(values.max()))
+    decades = math.log10(values.max() / values.min())
+    every = max(1, round(decades / _MOST_DECADES))
+    digits = (1, 2, 5) if decades < _DIGITS_SHOWN else (1,)
+    # one decade beyond either end is for error bars; what is not in the picture is not drawn
+    ticks = [(digit, power) for power in range(low - 1, high + 2) if power % every == 0 for digit in digits]
+    return [digit * 10.0**power for digit, power in ticks], [_tick_text(digit, power) for digit, power in ticks]
+
+
+def _tick_text(digit: int, power: int) -> str:
+    if -4 < power < 5:
+        return f"{digit * 10.0**power:g}"
+    return (f"{digit}·" if digit > 1 else "") + f"10<sup>{power}</sup>".replace("-", "−")
 
 
 def _nest(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -117,11 +117,10 @@ def bode_figure(
         Unit of the gain.
     """
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.05)
-    drawn, gains = [], []
+    drawn: list[FloatArray] = []
     for curve in curves:
         gain, phase_deg = gain_phase(sign * curve.system.response(omega))
         drawn.append(phase_deg)
-        gains.append(gain)
         add_line(figure, omega, gain, curve.name, curve.colour, dash=curve.dash, row=1, col=1)
         add_line(figure, omega, phase_deg, curve.name, curve.colour, dash=curve.dash, row=2, col=1, showlegend=False)
     measured: list[FloatArray] = []
@@ -130,7 +129,6 @@ def bode_figure(
         gain, phase_deg = gain_phase(np.array([sign * point.response for point in points]))
         bars = np.array([gain_phase_bars(point) for point in points]).reshape(-1, 2)
         measured.append(phase_deg)
-        gains.append(gain)
         for row, values, bar in ((1, gain, bars[:, 0]), (2, phase_deg, np.degrees(bars[:, 1]))):
             figure.add_trace(
                 go.Scatter(
@@ -145,26 +143,13 @@ def bode_figure(
                 row=row,
                 col=1,
             )
-    figure.update_xaxes(type="log", dtick=log_ticks([omega]))
+    figure.update_xaxes(type="log")
     figure.update_xaxes(title="angular frequency [rad/s]", row=2, col=1)
-    figure.update_yaxes(type="log", title=axis_title("gain", gain_unit), dtick=log_ticks(gains), row=1, col=1)
+    figure.update_yaxes(type="log", title=axis_title("gain", gain_unit), row=1, col=1)
     low, high, step = phase_axis(measured, drawn)
     room = 0.05 * (high - low)  # the lowest tick's number is not to meet the first one of the frequency axis
     figure.update_yaxes(title="phase [deg]", dtick=step, range=[low - room, high], row=2, col=1)
     return figure
-
-
-def log_ticks(drawn: Sequence[FloatArray]) -> str | int:
-    """Return the ticks of a logarithmic axis: 1, 2, 5 up to three decades, then powers of ten.
-
-    Parameters
-    ----------
-    drawn : sequence of (N,) array
-        What is drawn along the axis, in any unit.
-    """
-    values = np.concatenate([*drawn, np.empty(0)])
-    values = values[np.isfinite(values) & (values > 0.0)]
-    return "D2" if values.size and np.max(values) < 1e3 * np.min(values) else 1
 
 
 def phase_axis(measured: Sequence[FloatArray], drawn: Sequence[FloatArray]) -> tuple[float, float, float]:

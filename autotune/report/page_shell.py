@@ -97,9 +97,9 @@ function narrow(layout, width) {
   for (const key of Object.keys(layout).filter(key => /^[xy]axis/.test(key))) {
     const axis = layout[key], part = axis.domain ? axis.domain[1] - axis.domain[0] : 1;
     if (key[0] === "x" && axis.dtick === undefined) axis.nticks = Math.max(2, Math.floor(6 * part));
-    if (axis.title) axis.title.font = {size: 11};
+    if (axis.title) axis.title.font = {size: 12};
   }
-  layout.font.size = 11;
+  layout.font.size = 12;
 }
 function draw(div) {
   const {data, layout} = own(div.id);

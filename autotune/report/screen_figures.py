@@ -28,7 +28,6 @@ from autotune.diagnosis.evidence.screens import (
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.searched import Search
 from autotune.report import chart as go
-from autotune.report.figures import log_ticks
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, Figure, Section, Table, add_line, lines_figure, thin_curve
 
 #: Height of one screen's picture [px]; periods of the recomputed law that are drawn.
@@ -106,7 +105,6 @@ def _residual(found: Diagnosis, names: Sequence[str]) -> Section:
     y_unit = found.search.units[1]
     spectrum = spectrum_screen(retuned, extended, data)
     figure = lines_figure("frequency [Hz]", f"power density [{y_unit}²/Hz]", log_x=True, log_y=True)
-    figure.update_xaxes(dtick=log_ticks([spectrum.frequency_hz]))
     add_line(figure, spectrum.frequency_hz, spectrum.retuned, "retuned", ORANGE)
     add_line(figure, spectrum.frequency_hz, spectrum.extended, "extended", BLUE)
     add_line(figure, spectrum.frequency_hz, spectrum.noise, "noise model", GREY, dash="dot")

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autotune.report.chart import Chart, Scatter, make_subplots
+from autotune.report.chart import Chart, Scatter, log_ticks, make_subplots
 from autotune.report.figures import phase_axis
 from autotune.report.page import Figure, Page, Section, Table, add_line, lines_figure, write_page
 
@@ -43,11 +43,11 @@ def test_what_is_no_number_is_null():
     assert json.loads(chart.to_json())["data"][0]["y"] == [None, 0.3333333]
 
 
-def page_of(tmp_path, rows=3000):
+def page_of(tmp_path, rows=3000, *, log=False):
     t = np.linspace(0.0, 10.0, rows)
     figures = []
     for i in range(20):
-        figure = lines_figure("t [s]", "y [m]")
+        figure = lines_figure("t [s]", "y [m]", log_x=log, log_y=log)
         add_line(figure, t, np.sin(t + i), "measured", "#3b82c4")
         add_line(figure, t, np.cos(t + i), "</script>", "#d98200")
         figures.append(Figure(figure=figure, caption="<b>both</b>"))
@@ -63,6 +63,49 @@ def test_a_page_of_twenty_charts_stays_within_what_a_mail_takes_and_names_nobody
     assert len(content) < 1.5e6
     assert not re.findall(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//""", content)
     assert content.count("</script>") == content.count("<script")
+
+
+@pytest.mark.parametrize(
+    ("drawn", "values", "texts"),
+    [
+        ([0.02, 0.9], [0.02, 0.05, 0.1, 0.2, 0.5], ["0.02", "0.05", "0.1", "0.2", "0.5"]),
+        ([1e-9, 2e-6], [1e-9, 1e-8, 1e-7, 1e-6], [f"10<sup>−{power}</sup>" for power in (9, 8, 7, 6)]),
+        ([3e5, 8e5], [5e5], ["5·10<sup>5</sup>"]),
+    ],
+)  # fmt: skip
+def test_ticks_of_a_logarithmic_axis_are_whole_numbers(drawn, values, texts):
+    """A lone 2 or 5 between decades, as plotly writes it, is tiny and says nothing of the decade."""
+    ticks, numbers = log_ticks([np.array(drawn), np.array([np.nan, -1.0])])
+    shown = [i for i, tick in enumerate(ticks) if min(drawn) * 0.999 <= tick <= max(drawn) * 1.001]
+    assert [ticks[i] for i in shown] == pytest.approx(values)
+    assert [numbers[i] for i in shown] == texts
+
+
+def test_a_shared_axis_has_the_ticks_of_all_that_is_drawn_on_it():
+    chart = make_subplots(rows=2, cols=1, shared_xaxes=True)
+    for row, x in ((1, [0.1, 0.5]), (2, [1.0, 30.0])):
+        chart.add_trace(Scatter(x=np.array(x), y=np.ones(2)), row=row, col=1)
+    chart.update_xaxes(type="log")
+    layout = json.loads(chart.to_json())["layout"]
+    assert layout["xaxis"]["tickvals"] == layout["xaxis2"]["tickvals"]
+    assert {0.1, 20.0} <= set(layout["xaxis"]["tickvals"])
+
+
+@pytest.mark.system("chromium")
+def test_no_number_at_a_tick_is_smaller_than_twelve_pixels(tmp_path):
+    playwright = pytest.importorskip("playwright.sync_api")
+    path = page_of(tmp_path, 200, log=True)
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        for width in (1280, 400):
+            opened = browser.new_page(viewport={"width": width, "height": 800})
+            opened.goto(path.as_uri())
+            opened.wait_for_selector("body[data-drawn=yes]")
+            ticks = opened.locator(".xtick text, .ytick text")
+            sizes = ticks.evaluate_all("ticks => ticks.map(one => parseFloat(getComputedStyle(one).fontSize))")
+            assert len(sizes) > 100
+            assert min(sizes) >= 12.0
+        browser.close()
 
 
 @pytest.mark.system("chromium")
