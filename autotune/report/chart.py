@@ -217,6 +217,8 @@ class Chart:
             for trace in self.data
             if letter in trace and (shares or trace.get(f"{letter}axis", letter) == key.replace("axis", ""))
         ]
+        if letter == "y" and any(trace["type"] == "bar" for trace in self.data):
+            drawn.append(np.ones(1))  # bars stand on a count of one
         values, texts = log_ticks(drawn)
         return {**axis, "tickvals": values, "ticktext": texts}
 
