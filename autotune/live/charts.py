@@ -260,7 +260,7 @@ def _dots(name: str, x: FloatArray, y: FloatArray, colour: str, *, grid: int = 0
 def _region_edge(edge: ComplexArray, name: str) -> Options:
     """Return an open edge closed where it is furthest right, and its name below that: off region, point and curve."""
     turned = np.roll(edge, -int(edge.real.argmax()))
-    closed = np.append(turned, turned[0])
+    closed = np.concatenate([turned[-1:], turned, turned[:1]])  # the end's label hides the last piece: it is first, too
     return _line("95 % region", closed.real, closed.imag, ORANGE, width=1.6) | {
         "endLabel": {"show": True, "formatter": name, ":color": INK, "offset": [0, 9]},
         "labelLayout": {"hideOverlap": True},
