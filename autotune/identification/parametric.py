@@ -171,7 +171,7 @@ def fit_plant(points: Sequence[FrequencyPoint]) -> PlantFit:
     if len(points) < LEAST_POINTS:
         there_is = {0: "there is none", 1: "there is one"}.get(len(points), "there are two")
         raise IdentificationError(
-            f"a plant takes three frequency points, and {there_is}",
+            f"a plant takes at least three frequency points, and {there_is}",
             where="fit of the plant",
             remedy="move the command up and down, slowly and fast, while it is recorded; or let a relay measure points"
             " (autotune run)",

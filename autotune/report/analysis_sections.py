@@ -14,9 +14,9 @@ from autotune.config.procedure import SignalSettings
 from autotune.controller import PIDController
 from autotune.design.margins import margins
 from autotune.design.nugap import Validation
-from autotune.identification.parametric import LEAST_POINTS, PlantFit
+from autotune.identification.parametric import PlantFit
 from autotune.pipeline import Analysis
-from autotune.report.analysis_words import basis_text, with_units
+from autotune.report.analysis_words import basis_text, reason_without_reduced, with_units
 from autotune.report.figures import Curve, ratio_title
 from autotune.report.loop_diagrams import nichols_figure, nyquist_figure, sensitivity_figure
 from autotune.report.maker_forms import maker_table
@@ -83,7 +83,7 @@ def _model_section(analysis: Analysis, signals: SignalSettings) -> Section:
         + (f" {len(fit.others)} other structure(s) are not excluded by the data." if fit.others else "")
     )
     if reduced is None or analysis.unscaled is None or analysis.scaled is None:
-        return Section(title="Model", text=(fitted, _without_reduced(analysis)))
+        return Section(title="Model", text=(fitted, reason_without_reduced(analysis)))
     lag = [("lag frequency ω_0r [rad/s]", f"{reduced.omega_0r_rad_s:.4g}")] if reduced.omega_0r_rad_s else []
     return Section(
         title="Reduced model",
@@ -252,20 +252,6 @@ _PROMISES = {
     "points": "margins of every aperiodic plant through the points' 95 % regions",
     "fitted plant": "margins of every plant in the 95 % region of the fit, if its structure is right",
 }
-
-
-def _without_reduced(analysis: Analysis) -> str:
-    """Return why there is no reduced model, and what is to be done where one is wanted; empty where nobody knows."""
-    if analysis.fit.source == "recording" and len(analysis.points) < LEAST_POINTS:
-        shown = {0: "no", 1: "one"}.get(len(analysis.points), "two")
-        return (
-            "There is no reduced model, and this controller does not need one: it was designed on the"
-            f" {analysis.source}. A reduced model takes three frequency points; of u and y as they were recorded"
-            f" {shown} can be told. To have one, record while u goes up and down both slowly and fast, or let a relay"
-            " measure points (autotune run)."
-        )
-    why = dict(analysis.alternatives).get("reduced model", "")
-    return f"There is no reduced model: {why.removeprefix('reduced model: ')}." if isinstance(why, str) and why else ""
 
 
 def _price_table(analysis: Analysis, signals: SignalSettings) -> Table:

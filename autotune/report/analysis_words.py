@@ -7,7 +7,9 @@ import math
 from autotune.config.procedure import SignalSettings
 from autotune.controller import PIDController
 from autotune.design.specification import Design
+from autotune.identification.parametric import LEAST_POINTS
 from autotune.pipeline import Analysis
+from autotune.pipeline.analysis import of_use
 from autotune.report.figures import (
     ratio_title,
 )
@@ -86,3 +88,18 @@ def with_units(value: float, over: str, under: str) -> str:
         Units of the ratio's two parts; may be empty.
     """
     return ratio_title(f"{value:.4g}", over, under).translate({ord("["): None, ord("]"): None})
+
+
+def reason_without_reduced(analysis: Analysis) -> str:
+    """Return why there is no reduced model, and what is to be done where one is wanted; empty where nobody knows."""
+    usable = len(of_use(analysis.points))
+    if analysis.fit.source == "recording" and usable < LEAST_POINTS:
+        shown = {0: "none", 1: "one"}.get(usable, "two")
+        return (
+            "There is no reduced model, and this controller does not need one: it was designed on the"
+            f" {analysis.source}. A reduced model takes at least three frequency points; of u and y as they were"
+            f" recorded {shown} can be told. To have one, record while u goes up and down both slowly and fast, or let"
+            " a relay measure points (autotune run)."
+        )
+    why = dict(analysis.alternatives).get("reduced model", "")
+    return f"There is no reduced model: {why.removeprefix('reduced model: ')}." if isinstance(why, str) and why else ""

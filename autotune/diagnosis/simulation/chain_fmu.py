@@ -221,10 +221,10 @@ class _Translated:
                 return repr(float(value))
             case ast.Subscript(value=ast.Attribute(attr="acts")):
                 return "1"  # only what acts is written
-            case ast.Subscript(value=ast.Attribute(attr=name), slice=ast.Constant(value=place)):
-                return f"effects->{name}[{place}]"
-            case ast.Subscript(value=ast.Name(id=name), slice=ast.Constant(value=place)):
-                return f"{name}[{place}]"
+            case ast.Subscript(value=ast.Attribute(attr=name), slice=ast.Constant() as place):
+                return f"effects->{name}[{ast.unparse(place)}]"
+            case ast.Subscript(value=ast.Name(id=name), slice=ast.Constant() as place):
+                return f"{name}[{ast.unparse(place)}]"
             case ast.Attribute(value=ast.Name(id="math"), attr="pi"):
                 return repr(np.pi)
             case ast.UnaryOp(op=op, operand=operand):

@@ -16,9 +16,12 @@ from autotune.batch.row import Row
 from autotune.batch.settings import CampaignSettings
 from autotune.config.procedure import DesignSettings, SignalSettings
 from autotune.controller import PIDController
+from autotune.design.noise import LoopFacts
+from autotune.identification.parametric import fit_plant
 from autotune.models import TransferFunction
 from autotune.pipeline import analyse
 from autotune.points import FrequencyPoint
+from autotune.report.analysis_words import reason_without_reduced
 from autotune.report.campaign_page import campaign_page
 from autotune.report.maker_forms import maker_table
 from autotune.report.page import write_page
@@ -41,6 +44,23 @@ def test_an_oscillating_pair_is_told_by_its_frequency_and_damping():
     found = plant_figures(TransferFunction(num=(8.0,), den=(1.0, 0.4, 4.0, 0.0)))
     assert found["lags_s"] == "2 rad/s with damping 0.1"
     assert (found["integrators"], found["gain"]) == (1, 2.0)
+
+
+@pytest.mark.parametrize(("which", "shown"), [((), "none"), ((0,), "one"), ((2, 3, 4), "two")])
+def test_why_there_is_no_reduced_model_of_a_recording_is_a_sentence_with_a_remedy(which, shown):
+    """Points past -270 degrees are none that a reduction takes."""
+    plant = TransferFunction(num=(1.0,), den=(2.0, 3.0, 1.0), delay_s=1.0)
+    omega = np.array([0.2, 0.4, 0.7, 1.0, 2.6])
+    points = [
+        FrequencyPoint(omega_rad_s=w, response=complex(G), covariance=((v := abs(2e-3 * G) ** 2, 0.0), (0.0, v)))
+        for w, G in zip(omega, plant.response(omega), strict=True)
+    ]  # fmt: skip
+    fit = replace(fit_plant(points[:4]), source="recording")
+    given = [points[i] for i in which]
+    said = reason_without_reduced(analyse(given, DesignSettings(), fit=fit, facts=LoopFacts(sample_time_s=0.05)))
+    assert f"of u and y as they were recorded {shown} can be told" in said
+    assert "designed on the fitted plant" in said
+    assert "record while u goes up and down" in said
 
 
 @pytest.mark.parametrize(
