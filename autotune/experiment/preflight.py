@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import median
 
 import numpy as np
@@ -15,7 +15,7 @@ from autotune.errors import ExperimentStopped, LinkError
 from autotune.experiment.limits import START_ROOM, Watch
 from autotune.experiment.loop import ControlLoop, Timing
 from autotune.experiment.monitor import RECENT
-from autotune.experiment.rig import Exchanges, RunsRelay
+from autotune.experiment.rig import Exchanges, HandsBack, Rig, RunsRelay
 from autotune.points import FrequencyPoint
 
 PREFLIGHT_SAMPLES = 60
@@ -85,7 +85,9 @@ class Known:
     warnings: tuple[str, ...] = ()
 
 
-def preflight(loop: ControlLoop, point: OperatingPointSettings, gain_sd: float, tell: Tell) -> Known:
+def preflight(
+    loop: ControlLoop, point: OperatingPointSettings, gain_sd: float, tell: Tell, *, u_rest: float | None = None
+) -> Known:
     """Look before anything moves: link, noise, a sensor that is alive and in range.
 
     Parameters
@@ -94,6 +96,8 @@ def preflight(loop: ControlLoop, point: OperatingPointSettings, gain_sd: float, 
         The open loop, how its operating point is reached, and who is told.
     gain_sd : float
         Relative standard deviation at which a point is good enough.
+    u_rest : float, optional
+        Command that holds the operating point, where it is known from before [u unit].
 
     Raises
     ------
@@ -101,7 +105,10 @@ def preflight(loop: ControlLoop, point: OperatingPointSettings, gain_sd: float, 
         Link too slow, sensor at its rail or frozen.
     """
     tell("looking at link and noise")
-    start_u = _command_to_hold(loop, point) if point.approach == "hold" else loop.tick.u
+    start_u = _command_to_hold(loop, point, u_rest) if point.approach == "hold" else loop.tick.u
+    if point.approach == "hold" and not loop.shows_applied and _was_controlled(loop.rig):
+        # its own controller held y by about this, and not by the safe output, from which the rate would kick the plant
+        loop.tick = replace(loop.tick, u=start_u)
     first_row = loop.tick.k
     first: tuple[float, ...] = ()
     for _ in range(PREFLIGHT_SAMPLES):
@@ -161,16 +168,22 @@ def preflight(loop: ControlLoop, point: OperatingPointSettings, gain_sd: float, 
     )
 
 
-def _command_to_hold(loop: ControlLoop, point: OperatingPointSettings) -> float:
+def _command_to_hold(loop: ControlLoop, point: OperatingPointSettings, u_rest: float | None) -> float:
     """Return the command under which the rig is looked at where it is [u unit].
 
     What the rig says it applies, where y is near the operating point under it and u_guess allows it: nothing has to
-    move. Else u_guess.
+    move. Else what is known to hold it, or u_guess.
     """
     applied = loop.applied
     is_there = abs(loop.tick.y - point.y) <= START_ROOM * loop.envelope.settings.swing
     is_said = loop.shows_applied and abs(applied - point.u_guess) <= BRACKET * point.u_uncertainty
-    return applied if is_there and is_said else point.u_guess
+    known = point.u_guess if u_rest is None else u_rest
+    return applied if is_there and is_said else known
+
+
+def _was_controlled(rig: Rig) -> bool:
+    """Return whether the rig's own controller had the actuator until now."""
+    return isinstance(rig, HandsBack) and rig.former is not None
 
 
 def _check_at_rest(loop: ControlLoop, first_row: int, first: tuple[float, ...]) -> None:

@@ -158,7 +158,7 @@ def _experiment_on(
         if earlier.recordings and config.operating_point.approach == "ramp":
             wait_for_rest(loop)
         point, wanted = config.operating_point, config.experiment
-        known = preflight(loop, point, wanted.gain_sd, journal.tell)
+        known = preflight(loop, point, wanted.gain_sd, journal.tell, u_rest=earlier.u_rest)
         journal.enter(State.APPROACH)
         known = approach(loop, point, known, journal.tell, u_rest=earlier.u_rest)
         journal.enter(State.MIDPOINT)
@@ -242,7 +242,7 @@ def bring_to_operating_point(
         What was learnt; the plant is near its operating point, and the caller's law takes it from the next sample.
     """
     point, wanted = config.operating_point, config.experiment
-    known = preflight(loop, point, wanted.gain_sd, silent)
+    known = preflight(loop, point, wanted.gain_sd, silent, u_rest=u_rest)
     if plant_sign and u_rest is not None:
         known = replace(known, plant_sign=plant_sign, sign_seen=True, midpoint_seen=True)
     known = approach(loop, point, known, silent, u_rest=u_rest)
