@@ -66,6 +66,25 @@ def cluster(workers: int | None = None, scheduler: str | None = None, *, process
         with dask.config.set(_EMBEDDED), _start_embedded(tasks, processes) as local, Client(local) as client:
             yield client
         return
+    with _connected(scheduler) as client:
+        yield client
+
+
+def require_scheduler(scheduler: str) -> None:
+    """Refuse an existing scheduler that cannot be worked with: asked before there is anything to send to it.
+
+    Raises
+    ------
+    InputError
+        As :func:`cluster` does.
+    """
+    with _connected(scheduler):
+        pass
+
+
+@contextmanager
+def _connected(scheduler: str) -> Iterator[Client]:
+    """Connect to an existing scheduler whose workers have this version of the tool."""
     try:
         asyncio.run(_require_answer(scheduler))
         client = Client(scheduler, timeout=_PATIENCE_S)

@@ -30,7 +30,7 @@ def batch(
 
     require_extra("batch", "distributed", "pyarrow")
     from autotune.batch.campaign import REPORT, RESULTS, Campaign, failed, write_results
-    from autotune.batch.engine import cluster, run_all
+    from autotune.batch.engine import cluster, require_scheduler, run_all
     from autotune.batch.loop import analyse_loop
     from autotune.batch.row import ATTENTION
     from autotune.batch.settings import read_campaign
@@ -42,6 +42,8 @@ def batch(
     work.claim()
     console = Console(highlight=False, soft_wrap=True)
     rows = work.done(lambda line: console.print(line, markup=False))
+    if scheduler is not None and len(rows) < len(loops):
+        require_scheduler(scheduler)  # exports of a plant take long to prepare
     bars = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(

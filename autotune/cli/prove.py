@@ -60,13 +60,16 @@ def prove(
 
     if without not in ("", "all", *KINDS):
         raise unknown(without, "--without")
+    if without and recordings is not None:
+        raise InputError("--without and --recordings", where="prove", remedy="give one of the two")
     if scheduler is not None:
+        from autotune.batch.engine import require_scheduler
+
+        require_scheduler(scheduler)  # cases take minutes to make
         out = out.absolute()  # its workers were started elsewhere
     if recordings is None:
         _prove_simulated(out, range(seed, seed + (cases or 600)), ties, workers, (without, most), scheduler)
         return
-    if without:
-        raise InputError("--without and --recordings", where="prove", remedy="give one of the two")
     prove_recorded(recordings, out, cases, seed, workers, scheduler)
 
 

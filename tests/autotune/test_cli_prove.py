@@ -34,3 +34,13 @@ def test_a_folder_without_a_rig_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"model\.toml"):
         CliRunner().invoke(app, words, catch_exceptions=False)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("kind", ["simulated", "recorded"])
+def test_a_scheduler_that_is_none_is_refused_before_cases_are_made(tmp_path, kind):
+    words = ["prove", "--out", str(tmp_path / "out"), "--cases", "1", "--scheduler", "nonsense"]
+    if kind == "recorded":
+        words += ["--recordings", str(tmp_path)]
+    with pytest.raises(InputError, match="nonsense: no scheduler answers"):
+        CliRunner().invoke(app, words, catch_exceptions=False)
+    assert not (tmp_path / "out").exists()

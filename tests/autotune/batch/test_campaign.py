@@ -92,6 +92,15 @@ def test_a_campaign_in_which_nothing_can_be_analysed_is_refused_and_leaves_the_r
     assert (tmp_path / "out" / "report.html").stat().st_size > 0
 
 
+def test_a_scheduler_that_is_none_is_refused_before_anything_is_prepared(tmp_path):
+    (tmp_path / "c.toml").write_text('name = "a"\n[[loop]]\nname = "TIC1"\nfile = "gone.csv"\n')
+    words = ["batch", str(tmp_path / "c.toml"), "--out", str(tmp_path / "out"), "--scheduler", "nonsense"]
+    done = CliRunner().invoke(app, words)
+    assert isinstance(done.exception, InputError)
+    assert "nonsense: no scheduler answers" in str(done.exception)
+    assert not any((tmp_path / "out" / "loops").iterdir())
+
+
 def test_what_needs_attention_comes_first_and_a_failing_loop_is_a_row_with_its_reason(designed):
     _, _, rows = designed
     assert [(row.loop, row.attention) for row in rows] == [
