@@ -120,7 +120,10 @@ def _curve(found: RoutineDiagnosis) -> Section:
 def _comparison(found: RoutineDiagnosis) -> Section:
     valves, seen, answer = found.valves, found.oscillation, found.answer
     facts = [
-        ("ln(squared error by the command / by the best faulty valve)", f"{valves.decrease:+.2f}"),
+        (
+            "ln(squared error by the command / by the best faulty valve), beyond a sound one's",
+            f"{valves.decrease:+.2f}",
+        ),
         ("chance of as much in the same loop with a linear valve", f"{valves.chance:.2g}"),
         ("reversals of the best faulty valve", f"{valves.reversals}"),
         ("band S over u's range", f"{valves.valve.S / valves.span:.2f}"),

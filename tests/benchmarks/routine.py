@@ -2,7 +2,8 @@
 
 The loops are those of :mod:`tests.sim.valve_cases`: valves after Choudhury, He and Karnopp, play, tight tuning, outside
 oscillations, healthy loops. A claim is false where it names another cause than the true one; to abstain or to find
-nothing claims nothing.
+nothing claims nothing. Beside them are sound loops: a hundred linear ones of :mod:`tests.sim.linear_loops`, and loops
+that another one swings, not by a sine.
 """
 
 from __future__ import annotations
@@ -17,10 +18,14 @@ from typing import Any
 import numpy as np
 
 from autotune.diagnosis.routine import diagnose_routine
+from autotune.errors import AutotuneError
 from autotune.recording import Recording
-from tests.sim.valve_cases import KINDS, ValveCase, valve_case
+from tests.sim.linear_loops import linear_loop
+from tests.sim.valve_cases import KINDS, SHAPES, ValveCase, swung_from_outside, valve_case
 
 CASES, SEED = 13, 5000
+#: Linear loops, and loops that are swung by each shape.
+LINEAR, SWUNG = 100, 24
 #: What may be claimed of a kind: of a healthy loop nothing.
 RIGHT = {
     "stiction": ("stiction", "backlash"), "play": ("stiction", "backlash"), "tight_noise": ("tight_tuning",),
@@ -70,8 +75,44 @@ def print_table(rows: Iterable[dict[str, Any]]) -> None:
               f" inside its interval {inside} of {len(named)}")  # fmt: skip
 
 
+def said_of_linear(seed: int) -> tuple[str, str]:
+    """Return what drives a linear loop, and what is said of it."""
+    loop = linear_loop(seed)
+    try:
+        found = diagnose_routine([Recording(t=loop.dt_s * np.arange(loop.u.size), u=loop.u, y=loop.y)])
+    except AutotuneError as error:
+        print(f"linear loop {seed}: {error}", file=sys.stderr, flush=True)
+        return loop.disturbance, "refused"
+    return loop.disturbance, found.verdict
+
+
+def said_of_swung(which: tuple[str, bool, int]) -> tuple[str, str]:
+    """Return by what a sound loop is swung, and what is said of it."""
+    shape, wanders, seed = which
+    case = swung_from_outside(shape, seed, wanders=wanders)  # type: ignore[arg-type]
+    return f"{shape}, {'wandering' if wanders else 'steady'}", diagnose_routine([recorded(case)]).verdict
+
+
+def print_sound(title: str, said: Iterable[tuple[str, str]]) -> None:
+    """Print how often a valve was blamed where every valve follows, by what drives the loop.
+
+    Parameters
+    ----------
+    title : str
+        Of the first column.
+    said : iterable of (str, str)
+        What drives a loop, and the verdict.
+    """
+    count: dict[str, Counter[str]] = {}
+    for drives, verdict in said:
+        count.setdefault(drives, Counter())[verdict] += 1
+    print(f"\n| {title} | a valve blamed | refused | of |\n|---|---|---|---|")
+    for drives, told in count.items():
+        print(f"| {drives} | {told['stiction'] + told['backlash']} | {told['refused']} | {told.total()} |")
+
+
 def main() -> None:
-    """Print the table; ``ROUTINE_CASES=N,SEED`` in the environment sets cases per kind and first seed."""
+    """Print the tables; ``ROUTINE_CASES=N,SEED`` in the environment sets cases per kind and first seed."""
     cases, seed = (int(x) for x in os.environ.get("ROUTINE_CASES", f"{CASES},{SEED}").split(","))
     which = [(kind, s) for s in range(seed, seed + cases) for kind in KINDS]
     with ProcessPoolExecutor(int(os.environ.get("ROUTINE_WORKERS", "2"))) as pool:
@@ -79,4 +120,7 @@ def main() -> None:
         for row in pool.map(said_of, which):
             rows.append(row)
             print(row, file=sys.stderr, flush=True)
-    print_table(rows)
+        print_table(rows)
+        print_sound("linear loop", pool.map(said_of_linear, range(LINEAR)))
+        swung = [(shape, wanders, s) for shape in SHAPES for wanders in (False, True) for s in range(SWUNG)]
+        print_sound("swung from outside by", pool.map(said_of_swung, swung))

@@ -27,6 +27,9 @@ CaseKind: TypeAlias = Literal[
 KINDS: tuple[CaseKind, ...] = (
     "stiction", "play", "tight_noise", "tight_steps", "outside", "wandering", "quiet", "steps",
 )  # fmt: skip
+#: How another loop may swing this one.
+Shape: TypeAlias = Literal["triangle", "square", "saw"]
+SHAPES: tuple[Shape, ...] = ("triangle", "square", "saw")
 _STICKING: tuple[ValveKind, ...] = ("choudhury", "he", "friction")
 
 
@@ -95,6 +98,44 @@ def valve_case(kind: CaseKind, seed: int, rows: int = 2000) -> ValveCase:
     return ValveCase(
         kind=kind, loop=loop, dt_s=every * loop.cycle_s, r=setpoint[seen], u=u[seen], y=y[seen],
         position=position[seen],
+    )  # fmt: skip
+
+
+def swung_from_outside(shape: Shape, seed: int, *, wanders: bool, rows: int = 1500) -> ValveCase:
+    """Return a sound loop that another loop swings, as one with a sticking valve does: not by a sine.
+
+    Parameters
+    ----------
+    shape : str
+        Of the load over a period.
+    seed : int
+        Of the case.
+    wanders : bool
+        Whether the load's phase wanders.
+    rows : int
+        Recorded rows, 12 to 60 in the loop's own period.
+    """
+    random = np.random.default_rng((seed, 77))
+    loop, limit, omega = _plant(random)
+    own = 2.0 * math.pi / omega
+    every = max(1, round(own / random.uniform(12.0, 60.0)))
+    n = rows * every
+    size = abs(loop.gain) * (own if loop.integrating else 1.0)
+    loop = replace(loop, K=limit / random.uniform(2.0, 4.0))
+    load = _wandering(random, n, 3.0 * own, _between(random, 0.1, 1.0))
+    period, steps = own * _between(random, 1.3, 5.0), np.cumsum(random.normal(size=n))
+    phase = 2.0 * math.pi * np.arange(n) / period + math.sqrt(2.0 * math.pi * 0.02 / period) * wanders * steps
+    swing = {
+        "triangle": 2.0 / math.pi * np.arcsin(np.sin(phase)), "square": np.sign(np.sin(phase)),
+        "saw": 2.0 * (phase / (2.0 * math.pi) % 1.0) - 1.0,
+    }[shape]  # fmt: skip
+    load = load + random.uniform(2.0, 8.0) * swing
+    noise = size * _between(random, 0.02, 0.3) * random.normal(size=n)
+    u, y, position = simulate_loop(loop, Surroundings(setpoint=np.zeros(n), load=load, noise=noise))
+    seen = slice(0, None, every)
+    return ValveCase(
+        kind="wandering" if wanders else "outside", loop=loop, dt_s=every * loop.cycle_s, r=np.zeros(rows), u=u[seen],
+        y=y[seen], position=position[seen],
     )  # fmt: skip
 
 

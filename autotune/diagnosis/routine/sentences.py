@@ -58,9 +58,9 @@ def _compared(found: RoutineDiagnosis) -> str:
     change = abs(1.0 - math.exp(-valves.decrease))
     less = "less" if valves.decrease >= 0.0 else "more"
     return (
-        f"The position of the best faulty valve predicts y with {100.0 * change:.0f} % {less} squared"
-        f" error than the command does, over {valves.reversals} reversals of that valve; by chance it gains as much"
-        f" with a probability of {valves.chance:.2g}."
+        f"Beside predictions by the command, those by the position of the best faulty valve have {100.0 * change:.0f} %"
+        f" {less} squared error than they would in the same loop with a linear valve or a period late, over"
+        f" {valves.reversals} reversals; by chance they are as good with a probability of {valves.chance:.2g}."
     )
 
 

@@ -28,10 +28,10 @@ class RoutineThresholds:
     predicted_per_period: int = known(24, "rows", "of the dominant oscillation that are predicted, each a mean over its time", "convention")
     order: int = known(8, "rows", "of the past that a prediction sees: a third of a period", "convention")
     chance: float = known(0.005, "probability", "that the best faulty valve gains as much in the same loop with a linear one", "chance")
-    least_decrease: float = known(0.2, "ln of squared error", "that predictions by the valve's position must bring: 18 % less", "counted")
+    least_decrease: float = known(0.2, "ln of squared error", "that predictions by the valve's position must bring beyond what they bring in the same loop with a linear valve, or a period late: 18 % less", "counted")
     least_reversals: int = known(6, "reversals", "of the best faulty valve, before its fault is named: what has not turned has shown nothing of its band", "convention")
     least_band: float = known(0.1, "of u's range", "the narrowest band of a valve that is looked for; narrower ones act as dead time", "counted")
-    unlikely: float = known(0.05, "probability", "up to which what is not said may be true: that the other kind of fault wins in a resampling where sticking and play are told apart, or that chance made a faulty valve better than a linear one", "convention")
+    unlikely: float = known(0.05, "probability", "up to which what is not said may be true: that the other kind of fault wins in a resampling where sticking and play are told apart, or that chance made a faulty valve better than a linear one; what as rare a chance brings is what a decrease is measured from", "convention")
     resamplings: int = known(399, "resamplings", "of the linear loop's errors, for the chance, and of the half cycles, for the band's interval", "cost")
     # an oscillation
     regular: float = known(1.0, "1", "regularity from which on a signal oscillates (Thornhill et al. 2003)", "convention")

@@ -5,6 +5,8 @@ controller and the load are: a regression, which is consistent in a closed loop.
 its position predicts y better than the past of the command does; its band is not known, so the best of a grid is
 taken. How much the best of the grid gains by chance has no table (the band does not exist in a linear loop) and is
 counted: the linear prediction with its own errors, each with a random sign, is searched in the same way many times.
+What it gains there is also what a gain is measured from, not zero: the command knows what the controller read between
+the rows and before the past that is seen, so that in a linear loop even the best valve may predict worse than it.
 A sine of the dominant period is in both predictions: what swings a loop from outside is not predictable from a short
 past with noise on it, and would be laid to a valve that keeps time with it.
 
@@ -25,18 +27,18 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import f
 
-from autotune.arrays import BoolArray, FloatArray, IntArray
+from autotune.arrays import FloatArray, IntArray
 from autotune.diagnosis.routine.kernels import half_cycles, valve_position
 from autotune.diagnosis.routine.operation import Operation
+from autotune.diagnosis.routine.past import Past, basis_of, lags_of, means_of, past_of
 from autotune.diagnosis.routine.thresholds import RoutineThresholds
 from autotune.errors import InputError
 
 #: Bands up to nearly the command's range, slip jumps as a share of the band, where a valve stood at first.
 _BANDS, _WIDEST = 24, 0.98
 _JUMPS, _BEGINS = (0.0, 0.1, 0.25, 0.5, 0.75, 1.0), (-0.8, 0.0, 0.8)
-#: Directions of the past below this share of the largest are rounding: a controller without noise ties u to y.
-_ROUNDING = 1e-7
 
 
 class Valve(NamedTuple):
@@ -64,7 +66,9 @@ class ValveComparison:
     Attributes
     ----------
     decrease : float
-        Logarithm of the squared error of the linear prediction over that of the prediction by the valve's position.
+        By how much the prediction by the valve's position is better, of the logarithm of the squared error, beyond
+        what the best of all valves gains in the same loop with a linear one once in twenty times, and beyond what the
+        same position explains a period late.
     chance : float
         Probability that the best of all valves gains as much in the same loop with a linear one.
     reversals : int
@@ -99,39 +103,6 @@ class ValveComparison:
     position: FloatArray
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Past:
-    """Rows of y that are predicted, and what a level, a sine and y's own past say of them.
-
-    Attributes
-    ----------
-    of : Operation
-        The recordings.
-    every : int
-        Rows of the operation in each mean.
-    order : int
-        Means that a prediction sees.
-    rows : (N,) array of int
-        Means that are predicted.
-    own : (N, K) array
-        Orthonormal basis of the levels, a sine of the dominant period and y's own past.
-    left : (N,) array
-        What the basis leaves of y.
-    """
-
-    of: Operation
-    every: int
-    order: int
-    rows: IntArray
-    own: FloatArray
-    left: FloatArray
-
-    def beside(self, x: FloatArray) -> FloatArray:
-        """Return an orthonormal basis of what the past of a signal adds, (N, order) array or less."""
-        lags = _lags(_means(self.of, self.every, x), self.rows, self.order)
-        return _basis(lags, self.own)
-
-
 def compare_valves(
     operation: Operation, limits: RoutineThresholds, progress: Callable[[float], None] = lambda share: None
 ) -> ValveComparison:
@@ -154,10 +125,10 @@ def compare_valves(
     Notes
     -----
     Bias: a valve whose band is less than a tenth of the command's range is not looked for; quantised or compressed
-    records hold steps that no valve made. A load that is not Gaussian and swings at a constant size cannot be told
-    from a valve whose slips keep time with it.
+    records hold steps that no valve made. A load that steps between constant levels at irregular times cannot be told
+    from a valve whose slips keep time with it; one that swings regularly is told by what it was a period ago.
     """
-    past, random = _past(operation, limits), np.random.default_rng(0)
+    past, random = past_of(operation, limits), np.random.default_rng(0)
     low, high = np.quantile(operation.u, (0.002, 0.998))
     span = float(high - low)
     if not span > 0.0:
@@ -180,18 +151,56 @@ def compare_valves(
         gained = np.maximum(gained, ((null @ space) ** 2).sum(1))
     squared = errors**2
     best = int(np.argmin(squared.sum(1)))
-    decrease = float(_log_ratio(linear @ linear, squared[best].sum(), past.left @ past.left))
+    gain = float(_log_ratio(linear @ linear, squared[best].sum(), past.left @ past.left))
     by_chance = _log_ratio(total - by_command, total - gained, total)
-    half_cycle = half_cycles(_means(operation, past.every, operation.u), limits.least_band * span)
+    half_cycle = half_cycles(means_of(operation, past.every, operation.u), limits.least_band * span)
     drawn = _resampled(squared, half_cycle[past.rows], valves, limits.resamplings, random)
     position = position_of(operation, valves[best])
+    brought = float(np.quantile(by_chance, 1.0 - limits.unlikely)) + _periodic(past, position, limits.unlikely)
     return ValveComparison(
-        decrease=decrease, chance=float((1 + np.sum(by_chance >= decrease)) / (1 + by_chance.size)),
+        decrease=gain - brought,
+        chance=float((1 + np.sum(by_chance >= gain)) / (1 + by_chance.size)),
         reversals=_turns(position, operation), valve=valves[best], band=_interval(valves[best].S, drawn[:, 0], span),
         jump=_interval(valves[best].J, drawn[:, 1], span), sticks=float(np.mean(drawn[:, 1] > 0.0)), span=span,
         t=(past.rows * past.every).astype(np.float64) * operation.dt_s, linear=linear, faulty=errors[best],
         position=position,
     )  # fmt: skip
+
+
+def _periodic(past: Past, position: FloatArray, unlikely: float) -> float:
+    """Return what the distance of a position from the command one period ago explains: of the logarithm of the error.
+
+    A load that swings from outside is as well told by a valve that is a period late; one that sticks is not.
+
+    Parameters
+    ----------
+    past : Past
+        Rows that are predicted.
+    position : (R,) array
+        Position of a valve on the rows of the operation [u].
+    unlikely : float
+        What is explained by chance with this probability is none, by the F-test of a regression.
+    """
+    of, period = past.of, past.of.period_rows
+    late = past.rows * past.every >= (period + past.order * past.every if np.isfinite(period) else np.inf)
+    known = past.beside(of.u)
+    ago = basis_of(lags_of(means_of(of, past.every, _late(position - of.u, of)), past.rows, past.order), past.own)
+    without = np.column_stack([past.own, known])[late]
+    both = np.column_stack([without, ago[late]])
+    added, freedom = ago.shape[1], int(late.sum()) - both.shape[1]
+    if added == 0 or freedom < past.order:
+        return 0.0
+    errors = [past.left[late] - x @ np.linalg.lstsq(x, past.left[late], rcond=None)[0] for x in (without, both)]
+    sizes = np.array([e @ e for e in errors])
+    by_chance = np.log1p(added / freedom * f.ppf(1.0 - unlikely, added, freedom))
+    return max(float(_log_ratio(sizes[:1], sizes[1:], past.left @ past.left)[0] - by_chance), 0.0)
+
+
+def _late(x: FloatArray, of: Operation) -> FloatArray:
+    """Return a signal one period late in every recording; its first value holds until then."""
+    rows = round(of.period_rows) if np.isfinite(of.period_rows) else 0
+    parts = [x[of.rows_of(i)] for i in range(of.starts.size)]
+    return np.concatenate([np.pad(part, (min(rows, part.size), 0), mode="edge")[: part.size] for part in parts])
 
 
 def _turns(position: FloatArray, operation: Operation) -> int:
@@ -206,58 +215,7 @@ def position_of(operation: Operation, valve: Valve) -> FloatArray:
     return np.asarray(valve_position(operation.u, operation.starts, static, sliding, valve.runs_on, valve.begins))
 
 
-def _past(operation: Operation, limits: RoutineThresholds) -> _Past:
-    period, order = operation.period_rows, limits.order
-    every = max(1, int(period / limits.predicted_per_period)) if np.isfinite(period) else 1
-    lengths = np.diff(np.append(operation.starts, operation.u.size)) // every
-    recording = np.repeat(np.arange(lengths.size), lengths)
-    y = _means(operation, every, operation.y)
-    rows = np.flatnonzero(np.arange(y.size) - (np.cumsum(lengths) - lengths)[recording] >= order)
-    there = np.isfinite(y)
-    rows = rows[there[rows] & (2 * _lags(there, rows, order).sum(1) >= order)]
-    if rows.size < 6 * order:
-        raise InputError(
-            f"y can be predicted in {rows.size} place(s) only", where=", ".join(operation.names),
-            remedy="give a longer record, or one in which less of y is missing",
-        )  # fmt: skip
-    y = y[np.maximum.accumulate(np.where(there, np.arange(y.size), int(np.argmax(there))))]  # what is missing is held
-    inside = (recording[rows, None] == np.arange(lengths.size)).astype(np.float64)
-    levels = _basis(inside, np.empty((rows.size, 0)))
-    own = np.column_stack([levels, _basis(_sines(rows * every, inside, period), levels)])
-    own = np.column_stack([own, _basis(_lags(y, rows, order), own)])
-    target = y[rows] - levels @ (levels.T @ y[rows])
-    return _Past(of=operation, every=every, order=order, rows=rows, own=own, left=target - own @ (own.T @ target))
-
-
-def _sines(rows: IntArray, inside: FloatArray, period: float) -> FloatArray:
-    """Return sine and cosine of the dominant period for every recording, whose phases differ, (N, 2 R) array."""
-    if not np.isfinite(period):
-        return np.empty((rows.size, 0))
-    angle = 2.0 * np.pi * rows[:, None] / period
-    return np.column_stack([np.cos(angle) * inside, np.sin(angle) * inside])
-
-
-def _means(operation: Operation, every: int, x: FloatArray) -> FloatArray:
-    """Return means of so many rows, none across the end of a recording."""
-    parts = [x[operation.rows_of(i)] for i in range(operation.starts.size)]
-    return np.concatenate([part[: part.size // every * every].reshape(-1, every).mean(1) for part in parts])
-
-
-def _lags(x: FloatArray | BoolArray, rows: IntArray, order: int) -> FloatArray:
-    return np.asarray(x[rows[:, None] - np.arange(1, order + 1)])
-
-
-def _basis(columns: FloatArray, beside: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of what columns add to a basis; directions of rounding are left out."""
-    size = np.linalg.norm(columns - columns.mean(0), axis=0) if beside.size else np.linalg.norm(columns, axis=0)
-    scaled = columns / np.maximum(size, 1e-300)
-    for _ in range(2):  # twice: a controller without noise ties u to y, and what is left is small
-        scaled = scaled - beside @ (beside.T @ scaled)
-    left, sizes, _ = np.linalg.svd(scaled, full_matrices=False)
-    return np.asarray(left[:, sizes > _ROUNDING])
-
-
-def _null(past: _Past, space: FloatArray, linear: FloatArray, count: int, random: np.random.Generator) -> FloatArray:
+def _null(past: Past, space: FloatArray, linear: FloatArray, count: int, random: np.random.Generator) -> FloatArray:
     """Return what y's own past leaves of a linear loop's y: its prediction, and its errors of random sign."""
     fitted = past.own.shape[1] + space.shape[1]
     errors = linear * np.sqrt(linear.size / max(linear.size - fitted, 1))  # as large as before they were fitted to
