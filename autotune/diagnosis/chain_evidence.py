@@ -14,7 +14,7 @@ from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.adequacy import residual_tests
 from autotune.diagnosis.evidence.description import Description, describe
 from autotune.diagnosis.evidence.held_out import FitQuality
-from autotune.diagnosis.evidence.misread import misread_columns
+from autotune.diagnosis.evidence.misread import BUT_LATE, misread_columns
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.evidence.own_noise import OwnNoise
 from autotune.diagnosis.extended import extended_model, with_uncertainty
@@ -31,7 +31,7 @@ from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.simulation.chain import build_chain
 from autotune.diagnosis.simulation.forecast import forecast
 from autotune.diagnosis.verdict import OFFSET, Evidence
-from autotune.effects import KINDS, STRUCTURES, kind_of
+from autotune.effects import STRUCTURES, kind_of
 from autotune.models import Effect, Model, Parameter
 from autotune.recording import Recording
 
@@ -183,11 +183,11 @@ class ChainEvidence(Evidence):
     def misread_columns(self) -> str:
         """Say what is wrong with the columns, where the model then explains the recordings."""
 
-        def retuned(changed: Sequence[Recording], good: Sequence[BoolArray]) -> tuple[float, bool]:
-            found = search_chain(self.model, changed, good, KINDS, limits=self.limits)
-            return found.retuned.error, found.judged[0].heeds_commands
+        def read(changed: Sequence[Recording], good: Sequence[BoolArray]) -> tuple[float, bool]:
+            found = search_chain(self.model, changed, good, BUT_LATE, limits=self.limits)
+            return found.chosen.error, found.chosen.heeds_commands
 
-        return misread_columns(self.measured, self.model.input.offset, self.quality, self.limits, retuned)
+        return misread_columns(self.measured, self.model.input.offset, self.quality, self.limits, read)
 
     @property
     def measured(self) -> tuple[Recording, ...]:

@@ -21,6 +21,7 @@ from autotune.diagnosis.verdict import Evidence, judged
 from autotune.effects import require_known
 from autotune.equations.files import AnyModel
 from autotune.errors import InputError
+from autotune.identification.dependence import require_two_signals
 from autotune.models import Model
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
@@ -74,6 +75,8 @@ def diagnose(
     InputError
         No recording, fewer than 100 rows, u that is not finite, a time that is nearly all gaps, a column that is
         missing, an effect of the model that no catalogue has, or a model that runs away.
+    IdentificationError
+        A y that is a copy of u.
     """
     require_known(model.effects, model.name, in_chain=isinstance(model, Model))
     _require_rows(recordings)
@@ -163,3 +166,4 @@ def _require_rows(recordings: Sequence[Recording]) -> None:
         r.require_dense()
         if len(r) < LEAST_ROWS or np.isfinite(r.y).sum() < LEAST_ROWS:
             raise InputError(f"{len(r)} rows", where=r.name, remedy="a diagnosis needs at least 100 finite readings")
+        require_two_signals(r)

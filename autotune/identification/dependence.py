@@ -220,7 +220,7 @@ def require_answer(recordings: Sequence[Recording]) -> None:
         )
     for recording in moving:
         if len(recording) >= _LEAST_ROWS:
-            _require_two_signals(recording)
+            require_two_signals(recording)
     found = [recorded_dependence(recording) for recording in moving]
     if _answer(moving, found):
         return
@@ -249,11 +249,18 @@ def _answers_a_test(recording: Recording, found: Dependence) -> bool:
     return plant_evidence(recording) > NEEDED
 
 
-def _require_two_signals(recording: Recording) -> None:
+def require_two_signals(recording: Recording) -> None:
+    """Refuse a recording whose y is a copy of u, in another unit or with another zero.
+
+    Raises
+    ------
+    IdentificationError
+        It is one, to a millionth of its spread in every row.
+    """
     u, y = _bridge(recording.u), _bridge(recording.y)
     v, w = u - u.mean(), y - y.mean()
-    apart = w - (float(v @ w) / float(v @ v)) * v
-    if not is_constant(y) and float(np.linalg.norm(apart)) <= _COPY * float(np.linalg.norm(w)):
+    apart = w - (float(v @ w) / max(float(v @ v), 1e-300)) * v
+    if not is_constant(y) and not is_constant(u) and float(np.linalg.norm(apart)) <= _COPY * float(np.linalg.norm(w)):
         raise IdentificationError(
             "y is u, in every row, up to unit and offset: one signal under two names",
             where=recording.name,

@@ -12,13 +12,14 @@ from autotune.arrays import BoolArray
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.closed import ClosedBench
 from autotune.diagnosis.equations.equation_bench import EquationBench
-from autotune.diagnosis.equations.judged import JudgedEquations, judge
+from autotune.diagnosis.equations.equation_proposals import search_equations
+from autotune.diagnosis.equations.judged import JudgedEquations
 from autotune.diagnosis.equations.scores import slow_power, variance_ratio
 from autotune.diagnosis.equations.shown import EquationSearch
 from autotune.diagnosis.equations.sizes import command_of, spans_at, with_units
 from autotune.diagnosis.evidence.adequacy import ResidualTests
 from autotune.diagnosis.evidence.held_out import FitQuality
-from autotune.diagnosis.evidence.misread import misread_columns
+from autotune.diagnosis.evidence.misread import BUT_LATE, misread_columns
 from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.readable import in_commands, readable
 from autotune.diagnosis.result import FoundEffect, Verdict
@@ -112,16 +113,16 @@ class EquationEvidence(Evidence):
         if self.model.columns[0] != "u":
             return ""
 
-        def retuned(changed: Sequence[Recording], good: Sequence[BoolArray]) -> tuple[float, bool]:
+        def read(changed: Sequence[Recording], good: Sequence[BoolArray]) -> tuple[float, bool]:
             bench = bench_of(self.model, changed, good, self.limits)
             outcome = bench.retuned()
             error = bench.held_out_error(outcome, True) / bench.spread
             if error >= 1.0:  # no reading: a closed model may overflow where stretches are left out of it
                 return error, False
-            one = judge(bench, outcome, len(self.model.effects))
-            return error, one is not None and one.heeds_commands
+            found = search_equations(bench, BUT_LATE)
+            return found.chosen.error, found.chosen.heeds_commands
 
-        return misread_columns(self.given, self.model.inputs[0].offset, self.quality, self.limits, retuned)
+        return misread_columns(self.given, self.model.inputs[0].offset, self.quality, self.limits, read)
 
     def handed_out(self, verdict: Verdict) -> tuple[EquationModel | BlackBox, EquationModel | BlackBox]:
         """Return the model to go on with, and the one that was wanted."""
