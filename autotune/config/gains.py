@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from autotune.config.procedure import LimitSettings
 
-#: Of y's range, the error that moves the command through its whole range by K alone, and within one sample by K/T_I.
-#: No reading resolves a millionth of its range, and no limits of y are a hundred times as wide as what u can reach.
-LEAST_BAND, LEAST_INTEGRATED = 1e-6, 1e-2
+#: Of y's range, the error that moves the command through its whole range by K alone: no reading resolves a millionth.
+LEAST_BAND = 1e-6
+#: Of the swing that y may have, the error that moves it so within one sample by K/T_I: a loop of which that is true
+#: switches, and no swing is ten times as wide as what u can reach.
+LEAST_INTEGRATED = 0.1
 
 
 def beyond_ranges(K: float, Ti_s: float, limits: LimitSettings, sample_time_s: float) -> str | None:
@@ -27,14 +29,14 @@ def beyond_ranges(K: float, Ti_s: float, limits: LimitSettings, sample_time_s: f
     -----
     Wide: a gain that makes this plant's loop unstable may pass. What is known of the plant says more.
     """
-    u_range, y_range = limits.u_max - limits.u_min, limits.y_max - limits.y_min
-    for name, gain, least, within in (
-        (f"K = {K:.4g}", abs(K), LEAST_BAND, ""),
-        (f"K / T_I = {K / Ti_s:.4g} per s", abs(K) * sample_time_s / Ti_s, LEAST_INTEGRATED, " within one sample"),
-    ):
-        if gain * least * y_range > u_range:
-            return (
-                f"{name} moves the command through its whole range, {u_range:g},{within} for an error of"
-                f" {u_range / gain:.2g}, where y may be anywhere within {y_range:g}"
-            )
+    u_range, y_range, swing = limits.u_max - limits.u_min, limits.y_max - limits.y_min, limits.swing
+    moves = f"moves the command through its whole range, {u_range:g},"
+    if abs(K) * LEAST_BAND * y_range > u_range:
+        return f"K = {K:.4g} {moves} for an error of {u_range / abs(K):.2g}, where y may be anywhere within {y_range:g}"
+    integrated = abs(K) * sample_time_s / Ti_s if Ti_s > 0.0 else 0.0
+    if integrated * LEAST_INTEGRATED * swing > u_range:
+        return (
+            f"K / T_I = {K / Ti_s:.4g} per s {moves} within one sample for an error of {u_range / integrated:.2g},"
+            f" where y may swing by {swing:g}"
+        )
     return None

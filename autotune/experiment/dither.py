@@ -15,6 +15,7 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.config import Config
+from autotune.config.gains import beyond_ranges
 from autotune.controller import PIDController
 from autotune.design.law import LawState, PILaw
 from autotune.errors import InputError
@@ -73,12 +74,18 @@ def _present_controller(rig: Rig, config: Config) -> PIDController:
     Raises
     ------
     InputError
-        Neither says.
+        Neither says, or the rig's are none that a rig of these ranges runs with.
     """
     if config.controller is not None:
         return PIDController(K=config.controller.K, Ti_s=config.controller.Ti_s)
     if isinstance(rig, HoldsGains):
-        return rig.read_gains()
+        found = rig.read_gains()
+        if odd := beyond_ranges(found.K, found.Ti_s, config.limits, config.signals.sample_time_s):
+            raise InputError(
+                f"the rig says that it holds gains of which {odd}",
+                where="rig", remedy="check their registers with autotune probe, or write [controller] as it is now",
+            )  # fmt: skip
+        return found
     raise InputError(
         "the present controller is not known", where="[controller]", remedy="write K and Ti_s of the loop as it is now"
     )

@@ -47,6 +47,7 @@ def test_a_number_of_another_type_is_none(tmp_path: Path, value: str) -> None:
         ({"noise = 0.35": "noise = 1e308"}, r"rig\.noise = 1e\+308 is more than the 8 between limits\.y_min and y_max"),
         ({"K = -0.01": "K = 1e15"}, r"controller: K = 1e\+15 moves the command through its whole range, .* of 1e-14"),
         ({"K = -0.01": "K = -0.05", "Ti_s = 6.0": "Ti_s = 1e-6"}, r"controller: K / T_I = .* within one sample for"),
+        ({"Ti_s = 6.0": "Ti_s = 1e-6"}, r"controller: K / T_I = -1e\+04 per s moves .* within one sample for"),
     ],
 )
 def test_what_a_rig_has_is_what_its_ranges_can_mean(tmp_path: Path, written: dict[str, str], said: str) -> None:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from autotune.cli.closed_loop import dither
 from autotune.config import load_config
+from autotune.controller import PIDController
 from autotune.errors import InputError
 from autotune.experiment.dither import random_dwells, run_dither
 from autotune.identification.closed_loop.identify import identify_closed_loop
@@ -64,6 +65,18 @@ def test_amplitude_without_room_is_refused(tmp_path: Path) -> None:
     rig = open_rig(config.rig, u_range=(limits.u_min, limits.u_max), u_safe=limits.u_safe)
     with pytest.raises(InputError, match="amplitude"):
         run_dither(rig, config, tmp_path / "d.csv", duration_s=1.0, amplitude=1e6)
+
+
+@pytest.mark.parametrize(("K", "Ti_s"), [(1e15, 6.0), (-0.01, 1e-6)])
+def test_gains_that_a_rig_holds_and_no_rig_runs_with_are_not_run(tmp_path: Path, K: float, Ti_s: float) -> None:
+    """Registers read in the wrong order: what comes out is no law of these ranges."""
+    config = load_config(CONFIGS / "ball_sim.toml").model_copy(update={"controller": None})
+    rig = open_rig(config.rig, u_range=(config.limits.u_min, config.limits.u_max), u_safe=config.limits.u_safe)
+    rig.open()
+    rig.write_gains(PIDController(K=K, Ti_s=Ti_s))
+    rig.close()
+    with pytest.raises(InputError, match=r"the rig says that it holds gains of which K.* moves the command through"):
+        run_dither(rig, config, tmp_path / "d.csv", duration_s=1.0, amplitude=0.1)
 
 
 def test_recording_whose_sidecar_would_be_the_configuration_is_refused(tmp_path: Path) -> None:
