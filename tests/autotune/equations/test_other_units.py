@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autotune.arrays import FloatArray
-from autotune.equations import Drive, EquationModel, compile_model
+from autotune.equations import Drive, EquationModel, compile_model, retune
 from autotune.equations.expressions import Call, Expression, Name, Number, substitute
 from autotune.equations.linearise import Linear, linearise, transfer_function
 from autotune.equations.rest import rest_state, state_scales
@@ -18,6 +18,7 @@ from autotune.equations.simulate import derivatives, simulate
 from autotune.errors import InputError
 from drivers.model_plant import ModelPlant
 from tests.autotune.equations.models import model, one_state
+from tests.autotune.equations.test_fit import recorded
 
 TANKS = one_state("k*u - a*sqrt(max(x, 0))", {"k": 0.5, "a": 1.0})
 CASCADE = replace(
@@ -197,3 +198,13 @@ def test_a_twin_is_the_same_in_another_unit_of_time(case: str, time: float) -> N
     for plant, times in ((wanted, 1.0), (found, time)):
         plant.advance(u + 0.1, 0.2 * times)
     assert found.y_true == pytest.approx(wanted.y_true, rel=1e-4, abs=1e-7)
+
+
+@pytest.mark.parametrize("time", [1e3, 1e-3, 1.0 / 60.0])
+def test_retuned_numbers_are_the_same_in_another_unit_of_time(time: float) -> None:
+    truth = PENDULUM.with_parameters({"J": 0.06, "c": 0.03, "m": 0.55, "l": 0.29})
+    swung = [recorded(truth, 1), recorded(truth, 2)]
+    wanted = retune(compile_model(PENDULUM), swung)
+    found = retune(compile_model(in_time(PENDULUM, time)), [replace(one, t=time * one.t) for one in swung])
+    assert found.parameters == pytest.approx(wanted.parameters, rel=1e-3)
+    assert found.noise_sd == pytest.approx(wanted.noise_sd, rel=1e-3)

@@ -136,6 +136,15 @@ def test_units_and_signs_change_nothing_but_the_bands_unit(kind):
         assert second.band.value == pytest.approx(0.1 * first.band.value, rel=0.02)
 
 
+@pytest.mark.parametrize("time", [1e-3, 60.0])
+def test_the_unit_of_time_changes_nothing_but_the_period(time: float) -> None:
+    recording = loop_of("stiction", valve="choudhury", S=6.0, J=4.0)
+    first, second = diagnosed("stiction"), diagnose_routine([replace(recording, t=time * recording.t)])
+    assert second.verdict == first.verdict
+    assert second.valves.decrease == pytest.approx(first.valves.decrease, abs=1e-9)
+    assert second.oscillation.period_s == pytest.approx(time * first.oscillation.period_s)
+
+
 def test_readings_that_are_missing_do_not_change_the_verdict():
     recording = loop_of("stiction", valve="choudhury", S=6.0, J=4.0)
     y = recording.y.copy()
