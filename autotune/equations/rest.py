@@ -10,8 +10,6 @@ from autotune.equations.simulate import Compiled, Drive, derivatives, simulate
 
 #: What of a state's size, or of its answer to the command, is rounding.
 _ROUNDING = 1e-9
-#: How often the time of the fastest state and the sizes that states have after it are brought into agreement.
-_MOST_TIMES = 60
 #: How much more the reading counts than rest where both cannot be had.
 _READING = 1e3
 
@@ -57,32 +55,24 @@ def typical_sizes(
         What a state is and how far it moves from there; where that is nothing, how far a change of the inputs moves it.
         0 for a state that nothing moves.
     time_s : float
-        The time [s]; of a model that only integrates that in which a change of the inputs moves a state by what it is.
+        The time [s].
 
     Notes
     -----
     Each state makes one of Euler's steps when something first moves it: that reaches all, and scales with their units.
     """
     kicked = _kicked(inputs, input_sizes(compiled, inputs) if kick is None else kick)
-    time_s = 1.0
-    for _ in range(_MOST_TIMES):
-        sizes = _sizes_after(compiled, parameters, inputs, kicked, states, time_s)
+    time_s, sizes = 1.0, np.abs(states)
+    for _ in range(3):
+        moves = _first_moves(compiled, parameters, inputs, states, time_s)
+        sizes = _unless_rounding(
+            np.maximum(np.abs(states), moves), _first_moves(compiled, parameters, kicked, states, time_s)
+        )
         rate = _fastest_rate(compiled, parameters, inputs, states, sizes)
-        natural_s = 1.0 / rate if rate > 0.0 else _time_of_integrators(compiled, parameters, kicked, states)
-        before, time_s = time_s, natural_s
-        if abs(time_s - before) <= _ROUNDING * time_s:
+        if not rate > 0.0:
             break
-    return _sizes_after(compiled, parameters, inputs, kicked, states, time_s), time_s
-
-
-def _sizes_after(
-    compiled: Compiled, parameters: FloatArray, inputs: FloatArray, kicked: FloatArray, states: FloatArray,
-    time_s: float,
-) -> FloatArray:  # fmt: skip
-    """Return what each state is and how far it gets in some time; where that is nothing, how far a kick brings it."""
-    moves, _ = _first_moves(compiled, parameters, inputs, states, time_s)
-    answer, _ = _first_moves(compiled, parameters, kicked, states, time_s)
-    return _unless_rounding(np.maximum(np.abs(states), moves), answer)
+        time_s = 1.0 / rate
+    return sizes, time_s
 
 
 def _kicked(inputs: FloatArray, kick: FloatArray) -> FloatArray:
@@ -92,16 +82,16 @@ def _kicked(inputs: FloatArray, kick: FloatArray) -> FloatArray:
 
 def _first_moves(
     compiled: Compiled, parameters: FloatArray, inputs: FloatArray, states: FloatArray, time_s: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return how far each state gets in the first of Euler's steps that moves it, and which step that is."""
-    moves, steps = np.zeros(states.size), np.ones(states.size)
-    for step in range(1, states.size + 1):
+) -> FloatArray:
+    """Return how far each state gets in the first of Euler's steps that moves it."""
+    moves = np.zeros(states.size)
+    for _ in range(states.size):
         slopes = derivatives(compiled, parameters, (states + moves)[None, :], inputs[None, :])[0][0]
         new = np.where((moves == 0.0) & np.isfinite(slopes), time_s * slopes, 0.0)
         if not np.any(new):
             break
-        moves, steps = moves + new, np.where(new != 0.0, step, steps)
-    return np.abs(moves), steps
+        moves = moves + new
+    return np.abs(moves)
 
 
 def _unless_rounding(sizes: FloatArray, answer: FloatArray) -> FloatArray:
@@ -112,22 +102,12 @@ def _unless_rounding(sizes: FloatArray, answer: FloatArray) -> FloatArray:
 def _fastest_rate(
     compiled: Compiled, parameters: FloatArray, inputs: FloatArray, states: FloatArray, sizes: FloatArray
 ) -> float:
-    """Return the largest rate of the modes of changes by the states' sizes [1/s]; 0 where they only integrate."""
+    """Return the largest rate at which a change of all states by their sizes would undo itself [1/s]."""
     points = np.concatenate([states[None, :], states + np.diag(sizes)])
     slopes = derivatives(compiled, parameters, points, np.tile(inputs, (points.shape[0], 1)))[0]
-    felt = sizes > 0.0
-    rates = np.nan_to_num((slopes[1:] - slopes[0])[np.ix_(felt, felt)] / sizes[felt], posinf=0.0, neginf=0.0)
-    if not rates.size:
-        return 0.0
-    fastest = float(np.max(np.abs(np.linalg.eigvals(rates))))
-    return fastest if fastest > _ROUNDING * float(np.max(np.abs(rates))) else 0.0
-
-
-def _time_of_integrators(compiled: Compiled, parameters: FloatArray, kicked: FloatArray, states: FloatArray) -> float:
-    """Return the shortest time in which a change of the inputs moves a state by what it is [s]; 1 where all are 0."""
-    moves, steps = _first_moves(compiled, parameters, kicked, states, 1.0)
-    moved = (moves > 0.0) & (states != 0.0)
-    return float(np.min((np.abs(states[moved]) / moves[moved]) ** (1.0 / steps[moved]))) if np.any(moved) else 1.0
+    moves = np.nansum(np.abs(slopes[1:] - slopes[0]), axis=0)
+    felt = (sizes > 0.0) & np.isfinite(moves)
+    return float(np.max(moves[felt] / sizes[felt], initial=0.0))
 
 
 def rest_state(compiled: Compiled, parameters: FloatArray, inputs: FloatArray, y: float) -> FloatArray:
@@ -157,7 +137,7 @@ def rest_state(compiled: Compiled, parameters: FloatArray, inputs: FloatArray, y
     base = np.where(np.isfinite(given), given, 0.0)
     if free.size == 0:
         return base
-    sizes, time_s = typical_sizes(compiled, parameters, inputs, base)
+    sizes, _ = typical_sizes(compiled, parameters, inputs, base)
     sizes = np.where(sizes > 0.0, sizes, 1.0)
     seen, off = _in_reading(compiled, parameters, inputs, base, sizes, y)
     seen[~np.isin(np.arange(base.size), free)] = 0.0
@@ -167,7 +147,7 @@ def rest_state(compiled: Compiled, parameters: FloatArray, inputs: FloatArray, y
         sizes = np.where(np.abs(seen) > _ROUNDING * largest, sizes * abs(off) / largest, sizes)
         seen = np.where(np.abs(seen) > _ROUNDING * largest, seen * abs(off) / largest, seen)
     towards = off * seen / max(float(seen @ seen), 1e-300)
-    moves = _weighed_moves(compiled, parameters, inputs, base, sizes, base + sizes * towards, time_s)
+    moves = _weighed_moves(compiled, parameters, inputs, base, sizes, base + sizes * towards)
     reading = max(float(np.max(np.abs(seen), initial=0.0)), abs(off)) or 1.0
 
     def point(z: FloatArray) -> FloatArray:
@@ -192,15 +172,17 @@ def rest_state(compiled: Compiled, parameters: FloatArray, inputs: FloatArray, y
 
 def _weighed_moves(
     compiled: Compiled, parameters: FloatArray, inputs: FloatArray, base: FloatArray, sizes: FloatArray,
-    reading: FloatArray, time_s: float,
+    reading: FloatArray,
 ) -> FloatArray:  # fmt: skip
     """Return the slopes, (n,) [1/s], that weigh as much as one another where a rest and the reading cannot be had both.
 
-    What each state does in the time of the fastest; all so much larger that the state with the reading counts for more.
+    What each state does in a second; all of them so much larger that the state with the reading counts for more.
     """
     kicked = _kicked(inputs, input_sizes(compiled, inputs))
-    moves = _unless_rounding(*(_first_moves(compiled, parameters, one, base, time_s)[0] for one in (inputs, kicked)))
-    moves = np.where(moves > 0.0, moves, sizes) / time_s
+    moves = _unless_rounding(
+        _first_moves(compiled, parameters, inputs, base, 1.0), _first_moves(compiled, parameters, kicked, base, 1.0)
+    )
+    moves = np.where(moves > 0.0, moves, sizes)
     slopes = derivatives(compiled, parameters, reading[None, :], inputs[None, :])[0][0]
     ratios = np.abs(slopes) / moves
     return moves * float(np.max(ratios[np.isfinite(ratios)], initial=1.0))

@@ -1,4 +1,4 @@
-"""The same model written in other units of its states, its reading, its command and its time says the same."""
+"""The same model written in other units of its states, its reading and its command says the same."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autotune.arrays import FloatArray
-from autotune.equations import Drive, EquationModel, compile_model, retune
+from autotune.equations import Drive, EquationModel, compile_model
 from autotune.equations.expressions import Call, Expression, Name, Number, substitute
 from autotune.equations.linearise import Linear, linearise, transfer_function
 from autotune.equations.rest import rest_state, state_scales
-from autotune.equations.simulate import derivatives, simulate
+from autotune.equations.simulate import derivatives
 from autotune.errors import InputError
 from drivers.model_plant import ModelPlant
 from tests.autotune.equations.models import model, one_state
-from tests.autotune.equations.test_fit import recorded
 
 TANKS = one_state("k*u - a*sqrt(max(x, 0))", {"k": 0.5, "a": 1.0})
 CASCADE = replace(
@@ -62,13 +61,6 @@ def in_units(known: EquationModel, states: FloatArray, reading: float, command: 
         output=told(known.output, reading),
         inputs=(replace(known.inputs[0], offset=known.inputs[0].offset * command), *known.inputs[1:]),
     )  # fmt: skip
-
-
-def in_time(known: EquationModel, time: float) -> EquationModel:
-    """Return a model with its time told in another unit: as a number so many times."""
-    slower = Number(1.0 / time)
-    states = tuple(replace(one, derivative=Call("*", (slower, one.derivative))) for one in known.states)
-    return replace(known, states=states)
 
 
 @st.composite
@@ -154,57 +146,3 @@ def test_a_state_is_as_large_in_other_units(told: tuple[str, FloatArray, float, 
     wanted = sizes(known, start, 1.0)
     found = sizes(in_units(known, states, reading, command), start * states, command) / states
     assert found == pytest.approx(wanted, rel=1e-4)
-
-
-#: Of the same model and recording: in milliseconds, hours, microseconds.
-TIMES = st.sampled_from((1e3, 1e-3, 1.0 / 3600.0, 1e6, 60.0))
-
-
-@given(case=st.sampled_from(sorted(CASES)), time=TIMES)
-def test_a_rest_and_a_linearisation_are_the_same_in_another_unit_of_time(case: str, time: float) -> None:
-    known, u, y = CASES[case]
-    wanted = rests(known, u, y)
-    assert rests(in_time(known, time), u, y) == pytest.approx(wanted, rel=1e-5, abs=1e-7)
-    tangents: list[Linear | None] = []
-    for of in (known, in_time(known, time)):
-        try:
-            tangents.append(linearise(of, np.array([u]), y))
-        except InputError:
-            tangents.append(None)
-    if tangents[0] is None or tangents[1] is None:
-        assert tangents == [None, None]
-        return
-    np.testing.assert_allclose(time * tangents[1].A, tangents[0].A, rtol=1e-4, atol=1e-7)
-
-
-@given(case=st.sampled_from(sorted(CASES)), time=TIMES)
-def test_a_state_moves_alike_in_another_unit_of_time(case: str, time: float) -> None:
-    known, u, y = CASES[case]
-    t = np.arange(200) * 0.05
-    commands = u + 0.2 * np.sign(np.sin(t))
-    start, ends = rests(known, u, y), []
-    for of, times in ((known, t), (in_time(known, time), time * t)):
-        compiled, drive = compile_model(of), Drive(t=times, inputs=commands[:, None])
-        ends.append(simulate(compiled, compiled.parameter_vector, drive, start[None, :]).ends[0])
-    assert ends[1] == pytest.approx(ends[0], rel=1e-7)
-
-
-@given(case=st.sampled_from(sorted(CASES)), time=TIMES)
-def test_a_twin_is_the_same_in_another_unit_of_time(case: str, time: float) -> None:
-    known, u, _ = CASES[case]
-    wanted, found = ModelPlant(known, u_start=u), ModelPlant(in_time(known, time), u_start=u)
-    assert found.u_applied == pytest.approx(wanted.u_applied)
-    assert found.y_true == pytest.approx(wanted.y_true, rel=1e-6, abs=1e-9)
-    for plant, times in ((wanted, 1.0), (found, time)):
-        plant.advance(u + 0.1, 0.2 * times)
-    assert found.y_true == pytest.approx(wanted.y_true, rel=1e-4, abs=1e-7)
-
-
-@pytest.mark.parametrize("time", [1e3, 1e-3, 1.0 / 60.0])
-def test_retuned_numbers_are_the_same_in_another_unit_of_time(time: float) -> None:
-    truth = PENDULUM.with_parameters({"J": 0.06, "c": 0.03, "m": 0.55, "l": 0.29})
-    swung = [recorded(truth, 1), recorded(truth, 2)]
-    wanted = retune(compile_model(PENDULUM), swung)
-    found = retune(compile_model(in_time(PENDULUM, time)), [replace(one, t=time * one.t) for one in swung])
-    assert found.parameters == pytest.approx(wanted.parameters, rel=1e-3)
-    assert found.noise_sd == pytest.approx(wanted.noise_sd, rel=1e-3)
