@@ -97,11 +97,11 @@ def diagnose(
     whole = said_by(evidence)
     if not begins:
         return _diagnosis(evidence.keeping(()), said=whole)
+    if judged(evidence) == "effect" and (unheeded := evidence.unheeded_commands()):
+        return _diagnosis(evidence.keeping(()), unheeded)
     parts = parts_of(recordings, LEAST_ROWS)
     said = agreement(whole, begins, parts, _on_parts(evidence, progress), 0.0, thresholds)
     evidence = evidence.keeping(likely(said))
-    if judged(evidence) == "effect" and (unheeded := evidence.unheeded_commands()):
-        return _diagnosis(evidence.keeping(()), unheeded)
     return _diagnosis(evidence, said=said, kept=likely(said))
 
 
