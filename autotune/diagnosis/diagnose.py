@@ -97,12 +97,14 @@ def diagnose(
     whole = said_by(evidence)
     if not begins:
         return _diagnosis(evidence.keeping(()), said=whole)
-    if judged(evidence) == "effect" and (unheeded := evidence.unheeded_commands()):
-        return _diagnosis(evidence.keeping(()), unheeded)
     parts = parts_of(recordings, LEAST_ROWS)
     said = agreement(whole, begins, parts, _on_parts(evidence, progress), 0.0, thresholds)
-    evidence = evidence.keeping(likely(said))
-    return _diagnosis(evidence, said=said, kept=likely(said))
+    agreed = evidence.keeping(likely(said))
+    # what no part agrees on was found all the same, and may be what follows y whatever the command does
+    found = agreed if judged(agreed) == "effect" else evidence
+    if judged(agreed) != "unexplained" and (unheeded := found.unheeded_commands()):
+        return _diagnosis(agreed.keeping(()), unheeded)
+    return _diagnosis(agreed, said=said, kept=likely(said))
 
 
 def _diagnosis(
