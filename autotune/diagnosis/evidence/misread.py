@@ -59,12 +59,14 @@ def misread_columns(
     """
     if 2.0 * quality.retuned**2 < 1.0:
         return ""
+    as_they_are: float | None = None  # a search of its own, asked for once where a reading explains
     for what, changed in _readings(recordings, centre):
         error = _error_of(read, changed, limits)
         explains = 2.0 * error**2 < min(1.0, quality.retuned**2)
         if not explains or error >= (1.0 + limits.material) * quality.extended:
             continue
-        if error < (1.0 - limits.material) * _error_of(read, recordings, limits):
+        as_they_are = _error_of(read, recordings, limits) if as_they_are is None else as_they_are
+        if error < (1.0 - limits.material) * as_they_are:
             return (
                 f"First of all, {what}: so read, the retuned simulation, with a dead time where it lacks one, errs by"
                 f" {error:.3g} of the spread of y on rows that were left out, as they are by {quality.retuned:.3g}."
