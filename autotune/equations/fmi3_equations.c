@@ -1,11 +1,6 @@
 /* The equations above between communication points, by Dormand and Prince's pair.
    Inputs are held from one communication point to the next, and arrive DELAYS seconds later. */
 typedef struct {
-    double *t, *value;
-    size_t count, room;
-} History;
-
-typedef struct {
     double t, x[STATES + 1], in[INPUTS + 1], p[PARAMETERS + 1];
     History past[INPUTS + 1];
 } Model;
@@ -23,18 +18,7 @@ static void restart(Model *m)
 static Status note(History *past, double t, double value)
 {
     if (past->count && past->value[past->count - 1] == value) return OK;
-    if (past->count == past->room) {
-        size_t room = past->room ? 2 * past->room : 64;
-        double *times = realloc(past->t, room * sizeof *times);
-        if (times) past->t = times;
-        double *values = realloc(past->value, room * sizeof *values);
-        if (values) past->value = values;
-        if (!times || !values) return ERROR;
-        past->room = room;
-    }
-    past->t[past->count] = past->count ? t : -HUGE_VAL;
-    past->value[past->count++] = value;
-    return OK;
+    return append(past, past->count ? t : -HUGE_VAL, value);
 }
 
 /* What has arrived of every input at t, and until when that stays so, at most until an end. */

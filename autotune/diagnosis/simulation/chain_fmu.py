@@ -165,8 +165,7 @@ class _Translated:
     def __init__(self, node: ast.FunctionDef) -> None:
         self._arguments = [one.arg for one in node.args.args]
         self._local = {
-            name.id for part in ast.walk(node) for name in ast.walk(part)
-            if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store)
+            one.id for one in ast.walk(node) if isinstance(one, ast.Name) and isinstance(one.ctx, ast.Store)
         } - set(self._arguments)  # fmt: skip
         self._pairs = 0
         returned = [one.value for one in ast.walk(node) if isinstance(one, ast.Return)]
@@ -184,13 +183,8 @@ class _Translated:
         match node:
             case ast.Expr(value=ast.Constant()):
                 return
-            case ast.Return(value=ast.Tuple(elts=[first, second])):
-                yield f"return (Pair){{{self._value(first)}, {self._value(second)}}};"
             case ast.Return(value=value):
                 yield "return;" if value is None or _is_none(value) else f"return {self._value(value)};"
-            case ast.Assign(targets=[ast.Tuple(elts=targets)], value=ast.Tuple(elts=values)):
-                for target, value in zip(targets, values, strict=True):
-                    yield f"{self._value(target)} = {self._value(value)};"
             case ast.Assign(targets=[ast.Tuple(elts=[first, second])], value=value):
                 self._pairs += 1
                 yield f"Pair pair{self._pairs} = {self._value(value)};"
@@ -215,6 +209,8 @@ class _Translated:
         match node:
             case ast.Name(id=name):
                 return name
+            case ast.Tuple(elts=[first, second]):
+                return f"(Pair){{{self._value(first)}, {self._value(second)}}}"
             case ast.Constant(value=bool(value)):
                 return str(int(value))
             case ast.Constant(value=float() | int() as value):

@@ -8,8 +8,8 @@ typedef double Matrix[STATES + 1][COLUMNS];
 typedef struct {
     double t, x[STATES + 1], in[INPUTS + 1], p[PARAMETERS + 1];
     Effects effects;
-    double *row_t, *row_u; /* commands that were given, those that have long arrived left out */
-    size_t rows, room, at; /* the command in force is that of row `at` */
+    History given; /* commands, those that have long arrived left out */
+    size_t at; /* the command in force is that of row `at` */
     double t_0, w, sample, step, known[4];
     Matrix table[2][NODES + 1], M[4];
     int begun;
@@ -23,15 +23,15 @@ static void restart(Model *m)
     memcpy(m->p, P_0, sizeof P_0);
     memset(&m->effects, 0, sizeof m->effects);
     memcpy(m->effects.numbers, NUMBERS_0, sizeof NUMBERS_0);
-    m->rows = m->at = 0;
+    m->given.count = m->at = 0;
     m->sample = 0.0;
     m->begun = 0;
 }
 
 static void release(Model *m)
 {
-    free(m->row_t);
-    free(m->row_u);
+    free(m->given.t);
+    free(m->given.value);
 }
 
 /* Write exp(A i d) and its integrals times B for i = 0..NODES, d = step/NODES. */
@@ -148,7 +148,7 @@ static void hold_at_stop(Model *m)
 static void sub_step(Model *m, int slot, double begun, double dt)
 {
     double next[STATES + 1], t = begun - m->t_0;
-    double absolute = converter(m->row_u[m->at], t, &m->effects);
+    double absolute = converter(m->given.value[m->at], t, &m->effects);
     m->w = command(absolute - U_OFFSET, U_OFFSET, dt, t, 0.0, &m->effects);
     if (DIRECTIONAL && m->w < m->x[ACTUATOR]) slot += 2;
     for (int row = 0; row < STATES; row++) {
@@ -163,24 +163,14 @@ static void sub_step(Model *m, int slot, double begun, double dt)
 /* Note a command; what came before the one in force is forgotten now and then. */
 static Status note(Model *m, double t, double u)
 {
+    History *given = &m->given;
     if (m->at > 4096) {
-        m->rows -= m->at;
-        memmove(m->row_t, m->row_t + m->at, m->rows * sizeof *m->row_t);
-        memmove(m->row_u, m->row_u + m->at, m->rows * sizeof *m->row_u);
+        given->count -= m->at;
+        memmove(given->t, given->t + m->at, given->count * sizeof *given->t);
+        memmove(given->value, given->value + m->at, given->count * sizeof *given->value);
         m->at = 0;
     }
-    if (m->rows == m->room) {
-        size_t room = m->room ? 2 * m->room : 8192;
-        double *times = realloc(m->row_t, room * sizeof *times);
-        if (times) m->row_t = times;
-        double *commands = realloc(m->row_u, room * sizeof *commands);
-        if (commands) m->row_u = commands;
-        if (!times || !commands) return ERROR;
-        m->room = room;
-    }
-    m->row_t[m->rows] = t;
-    m->row_u[m->rows++] = u;
-    return OK;
+    return append(given, t, u);
 }
 
 /* The first command has been there for ever: what remembers commands begins with it. */
@@ -200,7 +190,7 @@ static void begin_run(Model *m)
 
 static double arrival(const Model *m)
 {
-    return m->at + 1 < m->rows ? m->t_0 + (m->row_t[m->at + 1] - m->t_0) + DELAY : HUGE_VAL;
+    return m->at + 1 < m->given.count ? m->t_0 + (m->given.t[m->at + 1] - m->t_0) + DELAY : HUGE_VAL;
 }
 
 static Status advance(Model *m, double t, double sample)
