@@ -205,17 +205,13 @@ class Chart:
         """Return a logarithmic axis with numbers of one size at its ticks: plotly's own between decades are tiny."""
         if not isinstance(axis, dict) or axis.get("type") != "log" or "tickvals" in axis:
             return axis
-        letter, shares = (
-            key[0],
-            "matches" in axis
-            or any(
-                isinstance(one, dict) and one.get("matches") == key.replace("axis", "") for one in self.layout.values()
-            ),
-        )
+        letter, name = key[0], key.replace("axis", "")
+        axes = [one for one in self.layout.values() if isinstance(one, dict)]
+        shares = "matches" in axis or any(one.get("matches") == name for one in axes)
         drawn = [
             np.asarray(trace[letter], dtype=np.float64)
             for trace in self.data
-            if letter in trace and (shares or trace.get(f"{letter}axis", letter) == key.replace("axis", ""))
+            if letter in trace and (shares or trace.get(f"{letter}axis", letter) == name)
         ]
         if letter == "y" and any(trace["type"] == "bar" for trace in self.data):
             drawn.append(np.ones(1))  # bars stand on a count of one

@@ -7,14 +7,20 @@ from pathlib import Path
 from typing import Any
 
 from autotune.config import Config, load_config
+from autotune.equations.chain import from_chain
+from autotune.equations.transfer_text import parse_transfer_function
 from autotune.experiment.loop import ControlLoop
 from autotune.experiment.run import envelope_of
+from autotune.models import Block, Model, Port
 from autotune.recording import RecordingWriter
+from drivers.model_plant import ModelPlant
 from drivers.simulated import SimulatedRig
 from sim.ball import make_ball
 from tests.sim.imperfections import Fault, FaultyPlant, FaultyRig
 
 CONFIG = Path(__file__).resolve().parents[3] / "configs" / "ball_sim.toml"
+#: command that holds textbook plants at 0 [V]
+U_REST = 5.0
 
 
 #: a limit cycle for each point: faults that come at a certain time of such a sweep
@@ -27,6 +33,17 @@ def ball_config(**sections: dict[str, Any]) -> Config:
     return config.model_copy(
         update={name: getattr(config, name).model_copy(update=keys) for name, keys in sections.items()}
     )
+
+
+def textbook_plant(written: str, *, u_start: float, noise: float) -> ModelPlant:
+    """Return a plant from its transfer function, at rest under a command until now."""
+    chain = Model(
+        name="plant",
+        input=Port(unit="V", offset=U_REST),
+        output=Port(unit="cm", offset=0.0),
+        blocks=(Block(name="plant", place="plant", dynamics=parse_transfer_function(written)),),
+    )
+    return ModelPlant(from_chain(chain), u_start=u_start, noise=noise)
 
 
 def ball_rig(*, seed: int = 1, noise: float = 0.35, faults: Sequence[Fault] = ()) -> SimulatedRig:

@@ -12,25 +12,19 @@ import numpy as np
 import pytest
 
 from autotune.config import Config, load_config
-from autotune.equations.chain import from_chain
-from autotune.equations.transfer_text import parse_transfer_function
 from autotune.errors import AutotuneError, ExperimentStopped, LinkError, OperatorStop
 from autotune.experiment.loop import ABORT
 from autotune.experiment.result import State, Status
 from autotune.experiment.rig import Reading
 from autotune.experiment.run import bring_to_operating_point, run_experiment
-from autotune.models import Block, Model, Port
 from autotune.recording import read_recording
-from drivers.model_plant import ModelPlant
 from drivers.simulated import SimulatedRig
 from sim.ball import make_ball
 from sim.plant import Plant
 from sim.tank import make_two_tank
-from tests.autotune.experiment.rigs import CONFIG, ball_config, open_loop
+from tests.autotune.experiment.rigs import CONFIG, U_REST, ball_config, open_loop, textbook_plant
 
 TANKS = CONFIG.with_name("two_tank_sim.toml")
-#: command that holds the textbook plants at 0 [V]
-U_REST = 5.0
 
 
 class WatchedRig(SimulatedRig):
@@ -73,13 +67,7 @@ def textbook(written: str, *, time_s: float, gain: float, off: float) -> tuple[W
     """Return a plant at rest at its operating point, and a configuration that ``init`` could have written of it."""
     swing = 1.25 * gain
     far = 4.0 * swing
-    chain = Model(
-        name="plant",
-        input=Port(unit="V", offset=U_REST),
-        output=Port(unit="cm", offset=0.0),
-        blocks=(Block(name="plant", place="plant", dynamics=parse_transfer_function(written)),),
-    )
-    plant = ModelPlant(from_chain(chain), u_start=U_REST, noise=0.01 * swing)
+    plant = textbook_plant(written, u_start=U_REST, noise=0.01 * swing)
     config = ball_config(
         signals={"sample_time_s": time_s / 40.0, "u_step": 0.0},
         limits={"u_safe": U_REST, "y_min": -far, "y_max": far, "swing": swing, "time_s": 1000.0 * time_s},

@@ -7,29 +7,16 @@ from pathlib import Path
 import pytest
 
 from autotune.config import load_config
-from autotune.equations.chain import from_chain
-from autotune.equations.transfer_text import parse_transfer_function
 from autotune.experiment.approach import approach, find_midpoint
 from autotune.experiment.preflight import Known, preflight
-from autotune.models import Block, Model, Port
-from drivers.model_plant import ModelPlant
 from drivers.simulated import SimulatedRig
 from sim.tank import make_two_tank
-from tests.autotune.experiment.rigs import CONFIG, ball_config, open_loop
-
-#: command that holds y at 0 [V]
-U_REST = 5.0
+from tests.autotune.experiment.rigs import CONFIG, U_REST, ball_config, open_loop, textbook_plant
 
 
 def learn_sign(folder: Path, written: str, *, time_s: float, samples: float, swing: float, u_before: float) -> Known:
     """Approach a plant that rested under another command until now, with noise of a hundredth of the swing."""
-    chain = Model(
-        name="plant",
-        input=Port(unit="V", offset=U_REST),
-        output=Port(unit="cm", offset=0.0),
-        blocks=(Block(name="plant", place="plant", dynamics=parse_transfer_function(written)),),
-    )
-    plant = ModelPlant(from_chain(chain), u_start=u_before, noise=0.01 * swing)
+    plant = textbook_plant(written, u_start=u_before, noise=0.01 * swing)
     config = ball_config(
         signals={"sample_time_s": time_s / samples, "u_step": 0.0},
         limits={
