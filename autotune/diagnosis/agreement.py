@@ -9,7 +9,7 @@ changes its name from part to part.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
@@ -66,7 +66,7 @@ def agreement(
     whole: Mapping[str, float],
     begins: Begins,
     parts: Sequence[Part],
-    said: Callable[[Part], Mapping[str, float]],
+    said: Sequence[Mapping[str, float]],
     least: float = NAMED,
     limits: Thresholds = IN_USE,
 ) -> Mapping[str, float]:
@@ -79,9 +79,9 @@ def agreement(
     begins : mapping of str to sequence of (int, float)
         When effects begin, where they do not act from the first row on.
     parts : sequence of Part
-        What is diagnosed again.
-    said : callable
-        Returns the probabilities by a part, NaN of an effect that it cannot tell.
+        What was diagnosed again.
+    said : sequence of mapping of str to float
+        Probabilities by each part, NaN of an effect that it cannot tell.
     least : float
         Probability from which on an effect is returned.
     limits : Thresholds
@@ -104,10 +104,9 @@ def agreement(
     Meinshausen and Buhlmann, J. R. Statist. Soc. B 72, 2010: stability selection; Genest and Zidek, Statist. Sci. 1,
     1986: the logarithmic pool of probabilities.
     """
-    heard = [(part, said(part)) for part in parts] if whole else []
     agreed = {}
     for name in whole:
-        all_said = [whole, *(one for part, one in heard if tells(part, begins.get(name, ())))]
+        all_said = [whole, *(one for part, one in zip(parts, said, strict=True) if tells(part, begins.get(name, ())))]
         told = [max(p, LEAST) for p in (one.get(name, 0.0) for one in all_said) if not math.isnan(p)]
         mean = float(np.exp(np.mean(np.log(told))))
         probability = undo_cooling(mean, limits) if mean >= NAMED and len(told) > 1 else mean

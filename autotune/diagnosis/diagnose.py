@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
 
 from autotune.controller import Controller
-from autotune.diagnosis.agreement import Part, agreement, likely, parts_of
+from autotune.diagnosis.agreement import agreement, likely, parts_of
 from autotune.diagnosis.equations.gathering_equations import evidence_of_equations
 from autotune.diagnosis.findings import alike, consistent, found_effects, places_of, said_by, sentences_of
 from autotune.diagnosis.gathering import evidence_of
@@ -92,13 +92,15 @@ def diagnose(
         evidence = evidence_of_equations(model, recordings, controller, without, told, thresholds)
     if columns := evidence.misread_columns():
         return _diagnosis(evidence.keeping(()), columns)
+    alone = evidence.keeping(likely(said_by(evidence)))
+    if not found_effects(alone, judged(alone)):
+        return _diagnosis(alone.keeping(()), said=said_by(alone))
+    parts = parts_of(recordings, LEAST_ROWS)
+    progress("once more on parts of the rows", WHOLE)
+    evidence, said_there = _hear_each_other(evidence, [alone.on(part) for part in parts])
     evidence = evidence.keeping(likely(said_by(evidence)))
     begins = {e.name: _begins(e, recordings) for e in found_effects(evidence, judged(evidence))}
-    whole = said_by(evidence)
-    if not begins:
-        return _diagnosis(evidence.keeping(()), said=whole)
-    parts = parts_of(recordings, LEAST_ROWS)
-    said = agreement(whole, begins, parts, _on_parts(evidence, progress), 0.0, thresholds)
+    said = agreement(said_by(evidence), begins, parts, said_there, 0.0, thresholds)
     agreed = evidence.keeping(likely(said))
     # what no part agrees on was found all the same, and may be what follows y whatever the command does
     found = agreed if judged(agreed) == "effect" else evidence
@@ -149,15 +151,19 @@ def _begins(effect: FoundEffect, recordings: Sequence[Recording]) -> list[tuple[
     return [(i, start) for i, start, _ in effect.windows if start > float(recordings[i].t[0])]
 
 
-def _on_parts(evidence: Evidence, progress: Progress) -> Callable[[Part], Mapping[str, float]]:
-    """Return what a part of the recordings says of what the whole made a candidate."""
+def _hear_each_other(
+    whole: Evidence, parts: Sequence[tuple[Evidence | None, Collection[str]]]
+) -> tuple[Evidence, list[Mapping[str, float]]]:
+    """Return what the whole shows and what each part says, with what any part chose judged on all of them.
 
-    def said(part: Part) -> Mapping[str, float]:
-        progress("once more on a part of the rows", WHOLE)
-        there, cannot_tell = evidence.on(part)
-        return {} if there is None else said_by(there) | dict.fromkeys(cannot_tell, math.nan)
-
-    return said
+    What a part cannot tell is NaN; a part where no simulation runs says nothing.
+    """
+    chosen = [None if there is None else there.chosen for there, _ in parts]
+    said: list[Mapping[str, float]] = []
+    for i, (there, untold) in enumerate(parts):
+        heard = None if there is None else there.hearing(chosen[:i] + chosen[i + 1 :])
+        said.append({} if heard is None else said_by(heard) | dict.fromkeys(untold, math.nan))
+    return whole.hearing(chosen), said
 
 
 def _require_rows(recordings: Sequence[Recording]) -> None:

@@ -144,6 +144,18 @@ class Evidence(ABC):
     def going_on(self, best: Any) -> Self:
         """Return the evidence with another hypothesis to go on with."""
 
+    @property
+    def chosen(self) -> Any:
+        """What a search chose, where it has effects and is weighed; else nothing."""
+        return self.found.chosen if self.found is not None and self.names and not self.own_noise else None
+
+    def hearing(self, others: Sequence[Any]) -> Self:
+        """Return the evidence with what was chosen on other rows judged as well: a search of these may miss it."""
+        if self.found is None or self.own_noise:
+            return self
+        found = self.found.hearing([one for one in others if one is not None])
+        return replace(self, found=found).going_on(found.chosen if found.best is self.found.best else found.best)
+
     def on(self, part: Sequence[Recording]) -> tuple[Evidence | None, Collection[str]]:
         """Return what a part of the recordings shows, searched among what all of them made a candidate.
 

@@ -83,7 +83,7 @@ class _EquationProposals(Proposals[JudgedEquations]):
         return found
 
     def resumed(self, one: JudgedEquations) -> JudgedEquations | None:
-        """Return a hypothesis that was fitted to more rows, fitted to these from its numbers; None if it runs away."""
+        """Return a hypothesis that was fitted to other rows, fitted to these from its numbers; None if it runs away."""
         return next(iter(self._judged([attempt(self.bench, one.outcome.effects, self.roots[0].outcome, FINAL)])), None)
 
     def smaller(self, some: Sequence[JudgedEquations], known: Sequence[JudgedEquations]) -> list[JudgedEquations]:

@@ -31,8 +31,7 @@ def recorded(rows: int) -> Recording:
 
 
 def shares(whole: Said, parts: Sequence[Said], begins: Begins = MappingProxyType({})) -> Mapping[str, float]:
-    answers = iter(parts)
-    return agreement(whole, begins, parts_of((recorded(1000),), 100), lambda part: next(answers))
+    return agreement(whole, begins, parts_of((recorded(1000),), 100), parts)
 
 
 def test_each_part_leaves_a_fifth_of_every_recording_out_at_one_of_its_ends() -> None:
