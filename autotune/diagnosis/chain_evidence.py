@@ -116,9 +116,7 @@ class ChainEvidence(Evidence):
         """Return the evidence with another hypothesis to go on with."""
         assert self.found is not None
         found, residual, floor = self.found, self.residual, self.quality.noise_floor
-        left = found.retuned if not best.names else found.chosen
-        if best.names and best is not found.chosen:
-            left = at_both_scales(best, found.judged).spread_out()
+        left = at_both_scales(best, found.judged).spread_out() if best.names else found.retuned
         if found.chosen.leaves_noise or left.leaves_noise:
             residual = residual_tests(left.fit, under_noise(left.fit, left.data), uneven=residual.uneven)
         found = replace(found, chosen=left)

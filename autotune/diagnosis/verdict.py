@@ -154,7 +154,8 @@ class Evidence(ABC):
         if self.found is None or self.own_noise:
             return self
         found = self.found.hearing([one for one in others if one is not None])
-        return replace(self, found=found).going_on(found.chosen if found.best is self.found.best else found.best)
+        heard = replace(self, found=found)
+        return heard if found.best is self.found.best else heard.going_on(found.best)
 
     def on(self, part: Sequence[Recording]) -> tuple[Evidence | None, Collection[str]]:
         """Return what a part of the recordings shows, searched among what all of them made a candidate.
