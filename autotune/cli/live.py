@@ -48,5 +48,5 @@ def live(
         typer.echo(url)
         serve(folder, bound, token, Run())
         return
-    Console(highlight=False, soft_wrap=True).print(f"live page: {url}; Ctrl-C ends it", markup=False)
+    Console(highlight=False, soft_wrap=True).print(f"live page, until Ctrl-C: {url}", markup=False)
     serve(folder, bound, token)

@@ -182,7 +182,7 @@ def steps_options(story: Story) -> Options:
     steps = {name: np.array(values) for name, values in story.steps.items()}
     t = steps["t"]
     band = _line("95 % band", t, steps["high"] - steps["low"], GREEN, width=0.0)
-    band |= STACK | {"areaStyle": {"color": GREEN, "opacity": 0.2}}
+    band |= STACK | {"areaStyle": {"color": GREEN, "opacity": 0.2}, "symbol": "roundRect", "showSymbol": False}
     return _options(
         grids=[{"top": 34, "bottom": 30}],
         x_axes=[_seconds(0.0, float(t[-1]))],
@@ -190,11 +190,11 @@ def steps_options(story: Story) -> Options:
         series=[
             _line("low", t, steps["low"], GREEN, width=0.0) | STACK,
             band,
-            _line("measured", t, steps["measured"], BLUE, width=2.0),
+            _line("measured, smoothed", t, steps["measured"], BLUE, width=2.0),
             _line("predicted", t, steps["predicted"], RED, width=1.6),
             _line("set-point", t, steps["setpoint"], GREY, dash="dashed", width=1.2),
         ],
-        legend=["95 % band", "measured", "predicted", "set-point"],
+        legend=["95 % band", "measured, smoothed", "predicted", "set-point"],
     )
 
 
@@ -245,7 +245,7 @@ def _line(
         "type": "line",
         "xAxisIndex": grid,
         "yAxisIndex": grid,
-        "showSymbol": False,
+        "symbol": "none",  # in the legend, too, where a hollow one is filled with white on any ground
         "lineStyle": {"color": colour, "width": width, "type": dash},
         "itemStyle": {"color": colour},
         "data": _pairs(x, y),
@@ -254,7 +254,7 @@ def _line(
 
 
 def _dots(name: str, x: FloatArray, y: FloatArray, colour: str, *, grid: int = 0) -> Options:
-    return _line(name, x, y, colour, grid=grid) | {"type": "scatter", "symbolSize": 8}
+    return _line(name, x, y, colour, grid=grid) | {"type": "scatter", "symbol": "circle", "symbolSize": 8}
 
 
 def _region_edge(edge: ComplexArray, name: str) -> Options:

@@ -152,7 +152,7 @@ class Screen:
             self._gains = ui.element("div").classes("gains").props('role=table aria-label="Old and new gains"')
             self._steps = ui.echart({}).classes("steps full-width")
             self._steps_note = ui.label(
-                "Set-point step, then load step: measured on the rig, and predicted with the band that holds 95 %."
+                "Set-point step, then load step: measured, and predicted with the band that holds 95 % of readings."
             ).classes("note")
             with ui.element("div").classes("choice") as self._choice:
                 ui.button("Keep new gains", on_click=lambda: self._on_choice("keep"), color=None).classes(

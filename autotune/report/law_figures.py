@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +22,8 @@ _COLOURS = {"nominal": PURPLE, "retuned": ORANGE, "extended": BLUE}
 _DASHES = {"nominal": "dot", "retuned": "dash", "extended": "solid"}
 #: A simulation may leave the measured span by this share of it within the picture.
 _MARGIN = 0.4
+#: A band that is nowhere farther from its line than this share of the line's height is not seen beside it.
+_UNSEEN = 0.005
 
 
 def file_names(recordings: Sequence[Recording]) -> tuple[str, ...]:
@@ -32,6 +34,23 @@ def file_names(recordings: Sequence[Recording]) -> tuple[str, ...]:
         if len(set(names)) == len(names):
             return names
     return tuple(f"{name} ({i})" for i, name in enumerate(names))
+
+
+def alike_once(curves: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    """Return curves by name, with those that run alike as one under both names: the one below would not be seen."""
+    merged: dict[str, FloatArray] = {}
+    for name, curve in curves.items():
+        same = next((other for other, drawn in merged.items() if np.array_equal(drawn, curve, equal_nan=True)), None)
+        if same is not None:
+            del merged[same]
+        merged[name if same is None else f"{same} and {name}"] = curve
+    return merged
+
+
+def style_of(name: str) -> tuple[str, str]:
+    """Return colour and dash of a model's curve; of one under two names those of the second."""
+    model = name.rsplit(" and ", 1)[-1]
+    return _COLOURS[model], _DASHES[model]
 
 
 def _with_unit(name: str, unit: str) -> str:
@@ -52,12 +71,10 @@ def free_run_figure(run: UnseenRun, name: str) -> Figure:
     figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.05, row_heights=[0.66, 0.34])
     add_line(figure, *thin_curve(run.t, run.y), "measured", GREY, width=2.4, row=1, col=1)
     shown: list[FloatArray] = []
-    for model, y in run.runs.items():
-        add_line(figure, *thin_curve(run.t, y), model, _COLOURS[model], dash=_DASHES[model], row=1, col=1)
-        add_line(
-            figure, *thin_curve(run.t, run.y - y), model, _COLOURS[model], dash=_DASHES[model], row=2, col=1,
-            showlegend=False,
-        )  # fmt: skip
+    for model, y in alike_once(run.runs).items():
+        colour, dash = style_of(model)
+        add_line(figure, *thin_curve(run.t, y), model, colour, dash=dash, row=1, col=1)
+        add_line(figure, *thin_curve(run.t, run.y - y), model, colour, dash=dash, row=2, col=1, showlegend=False)
         if model != "nominal" or len(run.runs) < 3:
             shown.append(run.y - y)
     low, high = float(np.nanmin(run.y)), float(np.nanmax(run.y))
@@ -120,7 +137,16 @@ def _caption_of_law(law: MissingLaw) -> str:
         if bins
         else "Residuals that go together over long stretches leave no bin that tells it from nothing."
     )
-    return f"{sentence(clause(law.effect))} The band is what its numbers' uncertainty makes of it (95 %). {said}"
+    return f"{sentence(clause(law.effect))} {_words_of_band(law)} {said}"
+
+
+def _words_of_band(law: MissingLaw) -> str:
+    """Say what the band is, or that it is not to be seen."""
+    height = max(float(np.ptp(b.law)) for b in law.branches)
+    widest = max(1.96 * float(np.max(np.nan_to_num(b.sd), initial=0.0)) for b in law.branches)
+    if widest < _UNSEEN * height:
+        return "What its numbers' uncertainty makes of it (95 %) is narrower than the line."
+    return "The band is what its numbers' uncertainty makes of it (95 %)."
 
 
 def _at(branch: Branch) -> FloatArray:

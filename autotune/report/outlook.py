@@ -283,7 +283,7 @@ def _figure(
         "len": 0.94, "currentvalue": {"visible": False},
     }  # fmt: skip
     chart.update_layout(sliders=[slider] if len(family) > 1 else [])
-    chart.update_yaxes(title=axis_title("change of y", signals.y_unit), row=1, col=1)
-    chart.update_yaxes(title=axis_title("change of u", signals.u_unit), row=2, col=1)
+    chart.update_yaxes(title=axis_title("Δy", signals.y_unit), row=1, col=1)
+    chart.update_yaxes(title=axis_title("Δu", signals.u_unit), row=2, col=1)
     chart.update_xaxes(title="time [s]", row=2, col=1)
     return chart

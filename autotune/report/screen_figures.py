@@ -28,6 +28,7 @@ from autotune.diagnosis.evidence.screens import (
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.searched import Search
 from autotune.report import chart as go
+from autotune.report.law_figures import alike_once, style_of
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, Figure, Section, Table, add_line, lines_figure, thin_curve
 
 #: Height of one screen's picture [px]; periods of the recomputed law that are drawn.
@@ -154,7 +155,8 @@ def over_time(found: Diagnosis) -> Figure:
         kept = [np.isfinite(squares[a:b]) for a, b in pieces]
         means = [np.mean(squares[a:b][ok]) if ok.any() else 0.0 for (a, b), ok in zip(pieces, kept, strict=True)]
         sizes[name] = np.sqrt(np.array(means))
-        add_line(figure, t, sizes[name], name, {"retuned": ORANGE, "extended": BLUE}[name])
+    for name, size in alike_once(sizes).items():
+        add_line(figure, t, size, name, style_of(name)[0])
     spread = float(np.nanstd(y)) or 1.0
     noise = found.fit.noise_floor * spread
     add_line(figure, t[[0, -1]], np.full(2, noise), "noise alone", GREY, dash="dot")
@@ -265,8 +267,8 @@ def trace_figures(found: Diagnosis, names: Sequence[str]) -> tuple[Figure, ...]:
     for i, (r, name, count) in enumerate(zip(search.recordings, names, search.runs(), strict=True)):
         figure = lines_figure("time [s]", f"y [{search.units[1]}]")
         add_line(figure, *thin_curve(r.t, r.y), "measured", GREY, width=1.0)
-        for model, simulated in search.simulated().items():
-            add_line(figure, *thin_curve(r.t, simulated[i]), model, {"retuned": ORANGE, "extended": BLUE}[model])
+        for model, y in alike_once({model: runs[i] for model, runs in search.simulated().items()}).items():
+            add_line(figure, *thin_curve(r.t, y), model, style_of(model)[0])
         how = "in one run" if count == 1 else f"in {count} windows, the state fitted at the start of each"
         figures.append(Figure(figure=figure, caption=f"{name}: measured, and simulated {how}.", height_px=HEIGHT))
     return tuple(figures)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -24,7 +25,7 @@ from autotune.report.diagnosis_page import write_diagnosis_page
 from autotune.report.diagnosis_words import how_they_add_up
 from autotune.report.effect_words import clause, join_clauses, number, of_candidate, with_spread
 from autotune.report.investigation_page import list_candidates
-from autotune.report.law_figures import file_names
+from autotune.report.law_figures import alike_once, file_names, style_of
 from tests.autotune.diagnosis.servo_rigs import GAIN, servo_model, servo_recording
 
 LAG = TransferFunction(num=(1.0,), den=(1.0, 1.0))
@@ -152,6 +153,16 @@ def test_beside_an_effect_that_no_hypothesis_has_nothing_else_is_missing() -> No
     assert list_candidates(left, "effect").startswith("nothing else is missing 0.95")
     assert list_candidates(left, "none").startswith("nothing is missing 0.95")
     assert "nothing is missing 0.01" in list_candidates((("actuator.lag", 0.99), ("none", 0.01)), "effect")
+
+
+def test_curves_that_run_alike_are_one_under_both_names_and_keep_a_gap_in_it() -> None:
+    y = np.array([0.0, np.nan, 1.0])
+    assert list(alike_once({"nominal": y + 1.0, "retuned": y, "extended": y.copy()})) == [
+        "nominal",
+        "retuned and extended",
+    ]
+    assert list(alike_once({"retuned": y, "extended": y + 1e-12})) == ["retuned", "extended"]
+    assert style_of("retuned and extended") == style_of("extended")
 
 
 def test_recordings_of_one_file_name_are_told_apart_by_their_folders() -> None:
