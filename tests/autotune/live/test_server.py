@@ -150,7 +150,7 @@ def test_a_served_page_refuses_other_users_counts_them_and_stays_quiet(tmp_path:
     command = [sys.executable, "-m", "autotune", "live", str(tmp_path)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
-    url = urlsplit(process.stdout.readline().split()[2].rstrip(";"))
+    url = urlsplit(process.stdout.readline().split()[-1])
     port, here = url.port or 0, f"127.0.0.1:{url.port}"
     head = f"Host: {here}\r\nConnection: close\r\n".encode()
     page = ask(port, f"GET {url.path}?{url.query} HTTP/1.1\r\n".encode() + head + b"\r\n")
