@@ -9,7 +9,7 @@ import math
 from collections.abc import Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -120,15 +120,13 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
     def resumed(self, one: JudgedChain) -> JudgedChain | None:
         """Return a hypothesis that was fitted to other rows, fitted to these from its numbers; None if it runs away.
 
-        It is asked for after a search as well, when that one's pool is gone.
+        It is asked for after a search as well, whose pool is gone then: nothing here needs it.
         """
-        with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
-            bench = replace(self.in_units_of(one), pool=pool)
-            try:
-                there = fit_from(one.fit.parametrisation, bench.long, one.fit.theta, iterations=LAST_STEPS)
-                return bench.judged(there, one.log_odds)
-            except RUNAWAY:
-                return None
+        bench = self.in_units_of(one)
+        with threadpool_limits(1), suppress(*RUNAWAY):
+            there = fit_from(one.fit.parametrisation, bench.long, one.fit.theta, iterations=LAST_STEPS)
+            return bench.judged(there, one.log_odds)
+        return None
 
     def smaller(self, some: Sequence[JudgedChain], known: Sequence[JudgedChain]) -> list[JudgedChain]:
         """Return hypotheses with each of their effects left out."""
