@@ -1,9 +1,9 @@
-"""How often another campaign on this rig would say the same: parts of the recordings, diagnosed as the whole was.
+"""How often another campaign on this rig would say the same: its hypotheses, judged on parts of the recordings.
 
 A search among a hundred effects always finds the one that suits these rows best, and a likelihood of these rows is sure
-of it. Whether the rig or these rows chose it shows where other rows are searched: each part leaves a fifth of every
-recording out, and is searched among what the whole recordings made a candidate. What another physics explains as well
-changes its name from part to part.
+of it. Whether the rig or these rows chose it shows on other rows: each part leaves a fifth of every recording out, and
+what was found on all of them is fitted and judged there. What another physics explains as well changes its name from
+part to part.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def agreement(
     begins : mapping of str to sequence of (int, float)
         When effects begin, where they do not act from the first row on.
     parts : sequence of Part
-        What was diagnosed again.
+        On which it was judged again.
     said : sequence of mapping of str to float
         Probabilities by each part, NaN of an effect that it cannot tell.
     least : float

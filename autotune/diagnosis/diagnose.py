@@ -34,7 +34,7 @@ WITHHELD = tuple(
     "nominal model, or it runs away on commands twice as large."
     for has in ("has retuned numbers alone", "is the model as it was")
 )
-#: Share of the work that the whole recordings take; parts of them are searched among fewer effects.
+#: Share of the work that the whole recordings take; on parts of them nothing is searched.
 WHOLE = 0.6
 
 

@@ -42,7 +42,7 @@ def evidence_of(
     without: Sequence[str],
     progress: Progress,
     thresholds: Thresholds,
-    begun: JudgedChain | None = None,
+    known: Sequence[JudgedChain] | None = None,
 ) -> ChainEvidence:
     """Return all that the verdict rests on: samples, search, what is beside the chain, the residual, held-out rows.
 
@@ -50,8 +50,8 @@ def evidence_of(
     ----------
     model, recordings, controller, without, progress, thresholds
         As in :func:`autotune.diagnosis.diagnose.diagnose`.
-    begun : JudgedChain, optional
-        What predicted best on more rows: it is judged as well, with its odds, from the numbers that it had there.
+    known : sequence of JudgedChain, optional
+        Hypotheses of more rows: they are judged, each from the numbers that it had there, and nothing is searched.
     """
     given, without = without, [*without, *unmoved(model, recordings)]
 
@@ -63,7 +63,7 @@ def evidence_of(
     own = {effect.name for effect in model.effects}
 
     retuned_rows = partial(_retuned_rows, model, recordings, thresholds)
-    searched = partial(_searched, model, recordings, without, progress, thresholds, begun)
+    searched = partial(_searched, model, recordings, without, progress, thresholds, known)
     seen = clear_samples(recordings, [name for name in without if name not in own], thresholds, retuned_rows)
     (near, found), seen = search_beside(searched, seen, without)
     seen = [s for s in seen if s.name not in own]
@@ -79,7 +79,7 @@ def evidence_of(
     samples = (*select_supported(seen, rows_of(retuned, data)), *beside(retuned, data))
     evidence = ChainEvidence(
         model=model,
-        again=lambda part, more, begun: evidence_of(model, part, controller, [*given, *more], quiet, thresholds, begun),
+        again=lambda part, more, known: evidence_of(model, part, controller, [*given, *more], quiet, thresholds, known),
         search=near,
         samples=samples,
         residual=residual_tests(retuned, data, uneven=any(kind_of(s.name).uneven for s in samples)),
@@ -114,7 +114,7 @@ def _searched(
     without: Sequence[str],
     progress: Progress,
     limits: Thresholds,
-    begun: JudgedChain | None,
+    known: Sequence[JudgedChain] | None,
     seen: list[SampleEffect],
 ) -> tuple[tuple[Search, Found[JudgedChain] | None], SimulatedRows]:
     """Return the retuned model near the noise, what was found beside it, and the rows that the best one simulates.
@@ -127,7 +127,7 @@ def _searched(
     alone = Hypothesis(names=(), fit=retuned)
     near = Search(data=data, nominal=at_nominal(retuned, data), retuned=alone, chosen=alone)
     try:
-        found = search_chain(model, recordings, good, names, progress, limits, begun)
+        found = search_chain(model, recordings, good, names, progress, limits, known)
     except RUNAWAY:
         return (near, None), rows_of(retuned, data)
     return (near, found), rows_of(found.chosen.fit, found.chosen.data)

@@ -17,7 +17,7 @@ from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.operating_point import Offset
 from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.result import FoundEffect, SearchResult, Verdict
-from autotune.diagnosis.selection.judged import Judged, of_likely, probabilities, rank
+from autotune.diagnosis.selection.judged import Judged, each_best, of_likely, probabilities, rank
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.thresholds import Thresholds
@@ -64,7 +64,7 @@ class Evidence(ABC):
     residual : ResidualTests
         What the chosen model leaves.
     again : callable
-        Returns what other recordings show, some effects left out, beginning with a hypothesis of these ones.
+        Returns what hypotheses of these recordings show on others, some samples' effects left out.
     found : Found, optional
         What a search found, where simulations do not run away and what is left is not noise of some rows.
     offset : Offset, optional
@@ -158,15 +158,16 @@ class Evidence(ABC):
         return heard if found.best is self.found.best else heard.going_on(found.best)
 
     def on(self, part: Sequence[Recording]) -> tuple[Evidence | None, Collection[str]]:
-        """Return what a part of the recordings shows, searched among what all of them made a candidate.
+        """Return what a part of the recordings shows: the hypotheses of all of them, fitted and judged there.
 
         Beside it stand effects that the part cannot tell; nothing where no simulation runs there.
         """
-        known = {name for names in self.leading for name in names} | {s.name for s in self.samples} | self.free
+        seen = {s.name for s in self.samples} | self.free
         best = None if self.found is None else self.found.chosen
+        known = [] if self.found is None else each_best([one for one in self.found.judged if one.names])
         untold = self.untold(part)
         try:
-            there = self.again(part, [name for name in KINDS if name not in known], best)
+            there = self.again(part, [name for name in KINDS if name not in seen], known)
             if best is not None and there.found is not None:
                 untold |= there.found.retuned.unfelt(best.added)
         except InputError:  # nothing runs there

@@ -62,6 +62,11 @@ def shared_name(name: str) -> str:
     return min((name, *KINDS[name].same, *KINDS[name].like))
 
 
+def forms_of(names: Iterable[str]) -> frozenset[str]:
+    """Return effects by one name for all forms of each: the one that it includes, or that none can tell from it."""
+    return frozenset(shared_name(min((name, *KINDS[name].includes), key=lambda n: n == name)) for name in names)
+
+
 def related_effects(names: Iterable[str]) -> set[str]:
     """Return the effects that are not added beside others: these, what they include, and what includes them."""
     given = set(names)

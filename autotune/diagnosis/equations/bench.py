@@ -106,6 +106,10 @@ class Bench(ABC):
     def fitted(self, effects: Sequence[Effect], start: Outcome, iterations: int) -> Outcome:
         """Return the model fitted with effects, from where another fit ended."""
 
+    def refitted(self, outcome: Outcome, iterations: int) -> Outcome:
+        """Return a fit to other rows fitted to these, from its numbers."""
+        return self.fitted(outcome.effects, outcome, iterations)
+
     @abstractmethod
     def with_trial(self, outcome: Outcome, effect: Effect) -> FloatArray | None:
         """Return how the readings change at the rows that count with one more effect, None where it runs away."""

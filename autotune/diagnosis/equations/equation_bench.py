@@ -273,6 +273,13 @@ class EquationBench(Bench):
                     horizon_s=length_s, iterations=iterations)  # fmt: skip
         return self._outcome(outcome.effects, found)
 
+    def refitted(self, outcome: Outcome, iterations: int) -> Outcome:
+        """Return a fit to other rows fitted to these, from its numbers: start states are those of these rows."""
+        compiled = self._compiled(outcome.effects)
+        z = self._start(compiled, outcome)
+        found = fit(compiled, self.recordings, z=z, horizon_s=self.length_s, iterations=LEAST_SOUGHT)
+        return self.fitted(outcome.effects, self._outcome(outcome.effects, found), iterations)
+
     def is_sought_outside(self, effect: Effect) -> bool:
         """Whether a direct search around the fits seeks one of the effect's numbers."""
         return bool(outer([effect]))

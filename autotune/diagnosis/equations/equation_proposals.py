@@ -39,7 +39,10 @@ CARRIED = 3
 
 
 def search_equations(
-    bench: Bench, without: Collection[str], progress: Progress = quiet, begun: JudgedEquations | None = None
+    bench: Bench,
+    without: Collection[str],
+    progress: Progress = quiet,
+    known: Sequence[JudgedEquations] | None = None,
 ) -> Found[JudgedEquations]:
     """Search for what is missing in equations, or in a closed model.
 
@@ -47,7 +50,7 @@ def search_equations(
     ----------
     bench, without
         The model on its recordings, and effects that are left out.
-    progress, begun
+    progress, known
         As in :func:`autotune.diagnosis.selection.search.search`.
 
     Raises
@@ -61,7 +64,7 @@ def search_equations(
     if retuned is None:
         raise InputError("the model runs away on left-out stretches", where="diagnose", remedy="check its numbers")
     nominal = replace(retuned, outcome=bench.as_it_is(outcome), tuned=False)
-    return search(_EquationProposals(bench=bench, without=without, nominal=nominal, roots=(retuned,)), progress, begun)
+    return search(_EquationProposals(bench=bench, without=without, nominal=nominal, roots=(retuned,)), progress, known)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,9 +85,14 @@ class _EquationProposals(Proposals[JudgedEquations]):
                 found += self._judged(_select(self.bench, fits, base.own))
         return found
 
-    def resumed(self, one: JudgedEquations) -> JudgedEquations | None:
-        """Return a hypothesis that was fitted to other rows, fitted to these from its numbers; None if it runs away."""
-        return next(iter(self._judged([attempt(self.bench, one.outcome.effects, self.roots[0].outcome, FINAL)])), None)
+    def refitted(self, some: Sequence[JudgedEquations]) -> list[JudgedEquations]:
+        """Return hypotheses of other rows fitted to these from their numbers, without those that run away."""
+        self.bench.signals(self.roots[0].outcome)  # sizes of what effects act on, by which their numbers are sought
+        fits = []
+        for one in some:
+            with suppress(InputError):
+                fits.append(self.bench.refitted(one.outcome, FINAL))
+        return self._judged(fits)
 
     def smaller(self, some: Sequence[JudgedEquations], known: Sequence[JudgedEquations]) -> list[JudgedEquations]:
         """Return hypotheses without each of their effects, or with a plainer one, as far as these are not known yet.

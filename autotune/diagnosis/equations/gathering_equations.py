@@ -31,7 +31,7 @@ def evidence_of_equations(
     without: Sequence[str],
     progress: Progress,
     limits: Thresholds,
-    begun: JudgedEquations | None = None,
+    known: Sequence[JudgedEquations] | None = None,
 ) -> EquationEvidence:
     """Return all that the verdict rests on: samples, search, the residual, held-out rows.
 
@@ -39,8 +39,8 @@ def evidence_of_equations(
     ----------
     model, recordings, controller, without, progress, limits
         As in :func:`autotune.diagnosis.diagnose.diagnose`.
-    begun : JudgedEquations, optional
-        What predicted best on more rows: it is judged as well, from the numbers that it had there.
+    known : sequence of JudgedEquations, optional
+        Hypotheses of more rows: they are judged, each from the numbers that it had there, and nothing is searched.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def evidence_of_equations(
 
     def searched(seen: list[SampleEffect]) -> tuple[Found[JudgedEquations], SimulatedRows]:
         bench = bench_of(model, recordings, unspoiled_rows(recordings, seen), limits)
-        found = search_equations(bench, [*without, *(s.name for s in seen)], progress, begun)
+        found = search_equations(bench, [*without, *(s.name for s in seen)], progress, known)
         return found, _rows_of(found.chosen.outcome, recordings, bench)
 
     seen = clear_samples(recordings, [name for name in without if name not in own], limits, retuned_rows)
@@ -70,9 +70,9 @@ def evidence_of_equations(
     return EquationEvidence(
         model=model, given=tuple(recordings), found=found, samples=tuple(samples),
         residual=residual_left(found, samples),
-        again=lambda part, more, then: evidence_of_equations(
+        again=lambda part, more, known: evidence_of_equations(
             model, [r.only(slice(r.first_reading, None)) for r in part], controller, [*without, *more], quiet, limits,
-            then,
+            known,
         ),
     )  # fmt: skip
 

@@ -24,7 +24,7 @@ from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.fitting.restarts import realign_effects
 from autotune.diagnosis.selection.bench import Bench, at_once, residual_sd
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
-from autotune.diagnosis.selection.judged import leading, rank
+from autotune.diagnosis.selection.judged import each_best, rank
 from autotune.diagnosis.selection.judged_chain import JudgedChain, at_both_scales
 from autotune.diagnosis.selection.prediction import distinct_starts, extend, predictions, signal_sizes, starting_effects
 from autotune.diagnosis.selection.refits import fit_without, move_time_of_change
@@ -51,7 +51,7 @@ def search_chain(
     left_out: Collection[str] = (),
     progress: Progress = quiet,
     limits: Thresholds = IN_USE,
-    begun: JudgedChain | None = None,
+    known: Sequence[JudgedChain] | None = None,
 ) -> Found[JudgedChain]:
     """Search for the physics that is missing in a chain.
 
@@ -61,7 +61,7 @@ def search_chain(
         Nominal model, what was measured, and which rows count.
     left_out : collection of str
         Effects that are not looked for.
-    progress, limits, begun
+    progress, limits, known
         As in :func:`autotune.diagnosis.selection.search.search`; what decides between findings.
 
     Returns
@@ -81,7 +81,7 @@ def search_chain(
             cuts=tuple(cut(recordings, good, length, limits) for length in lengths.between),
             few=cut(recordings, good, lengths.short, limits), odds=_odds(model, recordings, left_out), pool=pool,
         )  # fmt: skip
-        return search(_begin(model, bench), progress, begun)
+        return search(_begin(model, bench), progress, known)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -117,16 +117,21 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
         """Return what proposes beside a hypothesis, in units of the residual that it leaves."""
         return self.with_sd(residual_sd(best.fit, best.data), residual_sd(best.short, best.few))
 
-    def resumed(self, one: JudgedChain) -> JudgedChain | None:
-        """Return a hypothesis that was fitted to other rows, fitted to these from its numbers; None if it runs away.
+    def refitted(self, some: Sequence[JudgedChain]) -> list[JudgedChain]:
+        """Return hypotheses of other rows fitted to these from their numbers, without those that run away.
 
-        It is asked for after a search as well, whose pool is gone then: nothing here needs it.
+        They are asked for after a search as well, whose pool is gone then: nothing here needs it.
         """
-        bench = self.in_units_of(one)
-        with threadpool_limits(1), suppress(*RUNAWAY):
-            there = fit_from(one.fit.parametrisation, bench.long, one.fit.theta, iterations=LAST_STEPS)
-            return bench.judged(there, one.log_odds)
-        return None
+
+        def refit(one: JudgedChain) -> JudgedChain | None:
+            bench = self.in_units_of(one)
+            with suppress(*RUNAWAY):
+                there = fit_from(one.fit.parametrisation, bench.long, one.fit.theta, iterations=LAST_STEPS)
+                return bench.judged(there, one.log_odds)
+            return None
+
+        with threadpool_limits(1):
+            return [j for j in at_once(refit, some) if j is not None]
 
     def smaller(self, some: Sequence[JudgedChain], known: Sequence[JudgedChain]) -> list[JudgedChain]:
         """Return hypotheses with each of their effects left out."""
@@ -144,7 +149,7 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
 
     def finish_leading(self, found: Sequence[JudgedChain]) -> list[JudgedChain]:
         """Return the leading hypotheses fitted to the end, and what is larger fitted on from where the first one is."""
-        done = [j for j in self.pool.map(self.finished, leading(found, self.limits.leading)) if j is not None]
+        done = [j for j in self.pool.map(self.finished, each_best(found)[: self.limits.leading]) if j is not None]
         return [*done, *_refit_larger([*found, *done], self)]
 
     def settle_numbers(self, best: JudgedChain, found: Sequence[JudgedChain]) -> JudgedChain:

@@ -19,7 +19,7 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.stretches import STRETCHES
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.effects import KINDS, shared_name
+from autotune.effects import KINDS, forms_of, shared_name
 from autotune.models import Effect
 
 #: Added to squared errors, for a stretch without rows has none.
@@ -184,21 +184,26 @@ def rank(found: Sequence[_J]) -> list[_J]:
     return sorted(found, key=place)
 
 
-def leading(found: Sequence[_J], count: int) -> list[_J]:
-    """Return the first of a ranking, the best one of each set of effects."""
+def each_best(found: Sequence[_J]) -> list[_J]:
+    """Return the best hypothesis of each set of effects, by rank."""
     best: dict[frozenset[object], _J] = {}
     for one in rank(found):
         best.setdefault(one.identity, one)
-    return list(best.values())[:count]
+    return list(best.values())
 
 
 def built_on(found: Sequence[_J], count: int) -> list[_J]:
     """Return what a search builds on, of a ranking: its first ones, and what predicts best for all that it is rare.
 
-    What is usual in a rig may show only beside what is not: a root outflow beside the tank that runs over.
+    What is usual in a rig may show only beside what is not: a root outflow beside the tank that runs over. Forms of the
+    same effects take one place: two kinds of dry friction would leave none for gravity.
     """
     best = min(found, key=lambda j: j.log_squares, default=None)
-    return [*found[:count], *([] if best is None or any(best is j for j in found[:count]) else [best])]
+    forms: dict[frozenset[str], _J] = {}
+    for one in found:
+        forms.setdefault(forms_of(one.names), one)
+    first = list(forms.values())[:count]
+    return [*first, *([] if best is None or any(best is j for j in first) else [best])]
 
 
 def of_likely(found: Sequence[_J], likely: Collection[str]) -> _J:

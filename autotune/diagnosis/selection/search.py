@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Generic, Self, TypeVar
 
 from autotune.diagnosis.evidence.held_out import FitQuality
-from autotune.diagnosis.selection.judged import Judged, built_on, leading, rank
+from autotune.diagnosis.selection.judged import Judged, built_on, each_best, rank
 from autotune.progress import Progress, quiet
 
 _J = TypeVar("_J", bound=Judged)
@@ -51,8 +51,8 @@ class Proposals(ABC, Generic[_J]):
         return one
 
     @abstractmethod
-    def resumed(self, one: _J) -> _J | None:
-        """Return a hypothesis that was fitted to other rows, fitted to these from its numbers; None if it runs away."""
+    def refitted(self, some: Sequence[_J]) -> list[_J]:
+        """Return hypotheses of other rows fitted to these from their numbers, without those that run away."""
 
     @abstractmethod
     def smaller(self, some: Sequence[_J], known: Sequence[_J]) -> list[_J]:
@@ -100,7 +100,7 @@ class Found(Generic[_J]):
 
     def hearing(self, others: Sequence[_J]) -> Self:
         """Return it with hypotheses judged as well that were chosen on other rows, each from its numbers there."""
-        heard = [one for one in map(self.proposals.resumed, others) if one is not None]
+        heard = self.proposals.refitted(others)
         judged = (*self.judged, *heard)
         first = rank(judged)[0]
         return replace(self, judged=judged, best=first if any(first is one for one in heard) else self.best)
@@ -116,8 +116,8 @@ class Found(Generic[_J]):
         return FitQuality(nominal=nominal, retuned=retuned, extended=extended, noise_floor=noise_floor)
 
 
-def search(proposals: Proposals[_J], progress: Progress = quiet, begun: _J | None = None) -> Found[_J]:
-    """Search for the physics that is missing.
+def search(proposals: Proposals[_J], progress: Progress = quiet, known: Sequence[_J] | None = None) -> Found[_J]:
+    """Search for the physics that is missing, or judge what a search of more rows came to.
 
     Parameters
     ----------
@@ -125,9 +125,9 @@ def search(proposals: Proposals[_J], progress: Progress = quiet, begun: _J | Non
         The model on its recordings.
     progress : callable
         Told what is being done and the share done, 0 to 1.
-    begun : Judged, optional
-        What predicted best on more rows of these recordings: it is judged as well, from the numbers that it had there,
-        for a search of fewer rows may miss where it lies.
+    known : sequence of Judged, optional
+        Hypotheses of more rows of these recordings: they are judged, each from the numbers that it had there, and
+        nothing is searched.
 
     Returns
     -------
@@ -140,11 +140,12 @@ def search(proposals: Proposals[_J], progress: Progress = quiet, begun: _J | Non
     evidence outweigh that it is not. Where the model's error decides, it takes away a tenth of the held-out error, and
     stretches agree on it: what is excited in no stretch but one is found with less power.
     """
-    at, found = _grow(proposals, progress)
-    resumed = None if begun is None else at.resumed(begun)
-    found += [] if resumed is None else [resumed]
-    found = _prune(at, found)
-    found += at.finish_leading(found)
+    if known is not None:
+        at, found = proposals, [proposals.roots[0], *proposals.refitted(known)]
+    else:
+        at, found = _grow(proposals, progress)
+        found = _prune(at, found)
+        found += at.finish_leading(found)
     chosen = at.settle_numbers(rank(found)[0], found)
     retuned = chosen if not chosen.names else rank([one for one in found if not one.names])[0]
     nominal, retuned, chosen = (one.spread_out() for one in (proposals.nominal, retuned, chosen))
@@ -183,7 +184,7 @@ def _prune(at: Proposals[_J], found: Sequence[_J]) -> list[_J]:
     """
     result, done, limits = list(found), set[int](), found[0].limits
     for _ in range(limits.rig_effects):
-        fresh = [one for one in leading(result, limits.leading) if len(one.names) > 1 and id(one) not in done]
+        fresh = [one for one in each_best(result)[: limits.leading] if len(one.names) > 1 and id(one) not in done]
         if not fresh:
             break
         done |= {id(one) for one in fresh}

@@ -117,3 +117,10 @@ def test_what_predicts_best_is_built_on_though_it_is_too_rare_to_lead() -> None:
     assert built_on(order, 2) == [*order[:2], rare]
     assert built_on([rare, *usual], 2) == [rare, usual[0]]
     assert built_on([], 2) == []
+
+
+def test_two_kinds_of_dry_friction_leave_a_place_for_gravity() -> None:
+    falling = "plant.stribeck_friction"
+    order = [hypothesis_of((name,), size) for name, size in ((DRY, 0.5), (falling, 0.6), (GRAVITY, 0.7), (LAG, 0.8))]
+    assert built_on(order, 2) == [order[0], order[2]]
+    assert built_on([*order[1:], order[0]], 2) == [order[1], order[2], order[0]]  # what predicts best goes on as well

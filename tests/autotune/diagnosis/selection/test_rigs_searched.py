@@ -179,7 +179,7 @@ def test_what_stands_for_something_else_once_it_is_fitted_to_the_end_is_not_judg
         names=("plant.resonance",), fit=known, short=known, data=data, few=data, long_squares=np.ones(8),
         short_squares=np.ones(8), log_odds=0.0,
     )  # fmt: skip
-    found = search_chain(model, [recording], good(recording), begun=begun)
+    found = search_chain(model, [recording], good(recording)).hearing([begun])
     # another start of it may end in a bad fit that rings: that is judged, and far behind
     rings = [e.values["damping"] for one in found.judged for e in one.added if e.name == "plant.resonance"]
     assert all(damping < 1.0 for damping in rings), rings
@@ -188,10 +188,10 @@ def test_what_stands_for_something_else_once_it_is_fitted_to_the_end_is_not_judg
     assert sorted(lags.values()) == pytest.approx([19.0, 70.0], rel=0.1)
 
 
-def test_what_predicted_best_on_more_rows_is_judged_on_fewer_though_their_own_search_misses_it(rubbing):
+def test_what_predicted_best_on_more_rows_is_judged_on_fewer_with_its_odds(rubbing):
     recording, whole = rubbing[0], rubbing[1].chosen
     part = recording.only(np.arange(int(0.8 * len(recording))))
-    found = search_chain(pendulum(20.0, 0.1), [part], good(part), left_out=whole.names, begun=whole)
+    found = search_chain(pendulum(20.0, 0.1), [part], good(part), known=[whole])
     assert found.chosen.names == whole.names
     assert found.chosen.log_odds == whole.log_odds
 

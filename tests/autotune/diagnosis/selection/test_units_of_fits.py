@@ -48,7 +48,7 @@ def test_numbers_that_are_far_off_do_not_hold_an_effect_back_that_leaves_noise()
     # on a part of the rows it begins where it was, however little the model's own numbers explain there
     part = recording.read_from(160)
     readings = [np.isfinite(part.y)]
-    found = search_chain(lag(1.0), [part], readings, left_out=[kind.name for kind in ALL], begun=whole)
+    found = search_chain(lag(1.0), [part], readings, known=[whole])
     assert found.chosen.names == whole.names
     assert found.chosen.error * np.nanstd(part.y) == pytest.approx(NOISE, rel=0.1)
 
