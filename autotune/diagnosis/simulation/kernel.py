@@ -131,7 +131,7 @@ def _rubbed(work: _Work, taps: FloatArray, effects: Effects) -> float:
     per_force = _tap(taps, SPEED, work.column)
     if per_force == 0.0:
         return 0.0
-    needed = -_tap(taps, SPEED, work.free) / per_force
+    needed = -_tap(taps, SPEED, work.free) * (1.0 / per_force)
     return float(min(max(needed, -level), level))
 
 
@@ -172,13 +172,14 @@ def _rub(slot: int, w: float, pieces: int, linear: _Linear, x: FloatArray, effec
     column = M[slot, 0, 3], M[slot, 1, 3]
     speed = taps[SPEED, 0], taps[SPEED, 1]
     per_force = speed[0] * column[0] + speed[1] * column[1]
+    stops = 1.0 / per_force if per_force != 0.0 else 0.0
     for _ in range(pieces):
         free = M[slot, 0, 2] * w + M[slot, 0, 0] * first + M[slot, 0, 1] * second
         other = M[slot, 1, 2] * w + M[slot, 1, 0] * first + M[slot, 1, 1] * second
         rubbed = 0.0
         if per_force != 0.0:
             level = friction(speed[0] * first + speed[1] * second, effects)
-            rubbed = min(max(-(speed[0] * free + speed[1] * other) / per_force, -level), level)
+            rubbed = min(max(-(speed[0] * free + speed[1] * other) * stops, -level), level)
         first = free + column[0] * rubbed
         second = other + column[1] * rubbed
     x[0], x[1] = first, second
@@ -255,7 +256,7 @@ def run(
     effects = Effects(numbers, flags[FLAGS:], memory)
     before = Effects(numbers, flags[FLAGS:], carried)
     u_offset, y_offset, step = numbers[U_OFFSET], numbers[Y_OFFSET], numbers[STEP]
-    node_length = step / NODES
+    per_step, per_node = 1.0 / step, NODES / step  # a division takes as long as all else that a row of a chain needs
     past = 0
     for window in range(rows.shape[1]):
         first, last = rows[0, window], rows[1, window]
@@ -298,9 +299,11 @@ def run(
                 until = t[k + 1]
                 if now < comes < until:
                     until = comes
-                pieces = max(1, math.ceil((until - now) / step - 1e-6))
-                dt = (until - now) / pieces
-                node = min(dt / node_length, float(NODES))
+                dt = until - now
+                pieces = max(1, math.ceil(dt * per_step - 1e-6))
+                if pieces > 1:
+                    dt /= pieces
+                node = min(dt * per_node, float(NODES))
                 slot = 0 if now == t[k] else 1
                 _blend(tables[0], node, slot, linear)
                 if flags[DIRECTIONAL]:
