@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from autotune.controller import Controller
-from autotune.diagnosis.agreement import agreement, likely, parts_of
+from autotune.diagnosis.agreement import Part, agreement, likely, parts_of
 from autotune.diagnosis.equations.gathering_equations import evidence_of_equations
 from autotune.diagnosis.findings import alike, consistent, found_effects, places_of, said_by, sentences_of
 from autotune.diagnosis.gathering import evidence_of
@@ -97,13 +97,12 @@ def diagnose(
         return _diagnosis(alone.keeping(()), said=said_by(alone))
     parts = parts_of(recordings, LEAST_ROWS)
     progress("once more on parts of the rows", WHOLE)
-    evidence, said_there = _hear_each_other(evidence, [alone.on(part) for part in parts])
-    evidence = evidence.keeping(likely(said_by(evidence)))
-    begins = {e.name: _begins(e, recordings) for e in found_effects(evidence, judged(evidence))}
-    said = agreement(said_by(evidence), begins, parts, said_there, 0.0, thresholds)
+    said_there = [_said_on(part, alone) for part in parts]
+    begins = {e.name: _begins(e, recordings) for e in found_effects(alone, judged(alone))}
+    said = agreement(said_by(alone), begins, parts, said_there, 0.0, thresholds)
     agreed = evidence.keeping(likely(said))
     # what no part agrees on was found all the same, and may be what follows y whatever the command does
-    found = agreed if judged(agreed) == "effect" else evidence
+    found = agreed if judged(agreed) == "effect" else alone
     if judged(agreed) != "unexplained" and (unheeded := found.unheeded_commands()):
         return _diagnosis(agreed.keeping(()), unheeded)
     return _diagnosis(agreed, said=said, kept=likely(said))
@@ -151,19 +150,10 @@ def _begins(effect: FoundEffect, recordings: Sequence[Recording]) -> list[tuple[
     return [(i, start) for i, start, _ in effect.windows if start > float(recordings[i].t[0])]
 
 
-def _hear_each_other(
-    whole: Evidence, parts: Sequence[tuple[Evidence | None, Collection[str]]]
-) -> tuple[Evidence, list[Mapping[str, float]]]:
-    """Return what the whole shows and what each part says, with what any part chose judged on all of them.
-
-    What a part cannot tell is NaN; a part where no simulation runs says nothing.
-    """
-    chosen = [None if there is None else there.chosen for there, _ in parts]
-    said: list[Mapping[str, float]] = []
-    for i, (there, untold) in enumerate(parts):
-        heard = None if there is None else there.hearing(chosen[:i] + chosen[i + 1 :])
-        said.append({} if heard is None else said_by(heard) | dict.fromkeys(untold, math.nan))
-    return whole.hearing(chosen), said
+def _said_on(part: Part, whole: Evidence) -> Mapping[str, float]:
+    """Return what a part says, NaN of what it cannot tell; nothing where no simulation runs there."""
+    there, untold = whole.on(part)
+    return {} if there is None else said_by(there) | dict.fromkeys(untold, math.nan)
 
 
 def _require_rows(recordings: Sequence[Recording]) -> None:

@@ -144,19 +144,6 @@ class Evidence(ABC):
     def going_on(self, best: Any) -> Self:
         """Return the evidence with another hypothesis to go on with."""
 
-    @property
-    def chosen(self) -> Any:
-        """What a search chose, where it has effects and is weighed; else nothing."""
-        return self.found.chosen if self.found is not None and self.names and not self.own_noise else None
-
-    def hearing(self, others: Sequence[Any]) -> Self:
-        """Return the evidence with what was chosen on other rows judged as well: a search of these may miss it."""
-        if self.found is None or self.own_noise:
-            return self
-        found = self.found.hearing([one for one in others if one is not None])
-        heard = replace(self, found=found)
-        return heard if found.best is self.found.best else heard.going_on(found.best)
-
     def on(self, part: Sequence[Recording]) -> tuple[Evidence | None, Collection[str]]:
         """Return what a part of the recordings shows: the hypotheses of all of them, fitted and judged there.
 

@@ -118,10 +118,7 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
         return self.with_sd(residual_sd(best.fit, best.data), residual_sd(best.short, best.few))
 
     def refitted(self, some: Sequence[JudgedChain]) -> list[JudgedChain]:
-        """Return hypotheses of other rows fitted to these from their numbers, without those that run away.
-
-        They are asked for after a search as well, whose pool is gone then: nothing here needs it.
-        """
+        """Return hypotheses of other rows fitted to these from their numbers, without those that run away."""
 
         def refit(one: JudgedChain) -> JudgedChain | None:
             bench = self.in_units_of(one)
@@ -130,8 +127,7 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
                 return bench.judged(there, one.log_odds)
             return None
 
-        with threadpool_limits(1):
-            return [j for j in at_once(refit, some) if j is not None]
+        return [j for j in self.pool.map(refit, some) if j is not None]
 
     def smaller(self, some: Sequence[JudgedChain], known: Sequence[JudgedChain]) -> list[JudgedChain]:
         """Return hypotheses with each of their effects left out."""

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Generic, Self, TypeVar
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.selection.judged import Judged, built_on, each_best, rank
@@ -87,8 +87,6 @@ class Found(Generic[_J]):
         The one that predicts best, for what it is.
     chosen : Judged
         The one to go on with: the best one, or what is left of it where parts of the recordings do not agree.
-    proposals : Proposals
-        What fits further hypotheses.
     """
 
     nominal: _J
@@ -96,14 +94,6 @@ class Found(Generic[_J]):
     judged: tuple[_J, ...]
     best: _J
     chosen: _J
-    proposals: Proposals[_J]
-
-    def hearing(self, others: Sequence[_J]) -> Self:
-        """Return it with hypotheses judged as well that were chosen on other rows, each from its numbers there."""
-        heard = self.proposals.refitted(others)
-        judged = (*self.judged, *heard)
-        first = rank(judged)[0]
-        return replace(self, judged=judged, best=first if any(first is one for one in heard) else self.best)
 
     @property
     def others(self) -> tuple[_J, ...]:
@@ -149,7 +139,7 @@ def search(proposals: Proposals[_J], progress: Progress = quiet, known: Sequence
     chosen = at.settle_numbers(rank(found)[0], found)
     retuned = chosen if not chosen.names else rank([one for one in found if not one.names])[0]
     nominal, retuned, chosen = (one.spread_out() for one in (proposals.nominal, retuned, chosen))
-    return Found(nominal=nominal, retuned=retuned, judged=tuple(found), best=chosen, chosen=chosen, proposals=at)
+    return Found(nominal=nominal, retuned=retuned, judged=tuple(found), best=chosen, chosen=chosen)
 
 
 def _grow(at: Proposals[_J], progress: Progress) -> tuple[Proposals[_J], list[_J]]:

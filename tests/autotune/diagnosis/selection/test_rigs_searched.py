@@ -175,13 +175,16 @@ def test_what_stands_for_something_else_once_it_is_fitted_to_the_end_is_not_judg
     p, theta, states = extend(start, Effect(name="plant.resonance", parameters=values), data)
     known = fit(p, data, theta, states)
     assert known.model.effects[0].parameters["damping"].value > 1.0
-    begun = JudgedChain(
+    stand_in = JudgedChain(
         names=("plant.resonance",), fit=known, short=known, data=data, few=data, long_squares=np.ones(8),
         short_squares=np.ones(8), log_odds=0.0,
     )  # fmt: skip
-    found = search_chain(model, [recording], good(recording)).hearing([begun])
+    found = search_chain(model, [recording], good(recording))
+    again = search_chain(model, [recording], good(recording), known=[stand_in, *found.judged[1:]])
+    assert len(again.judged) == len(found.judged)
     # another start of it may end in a bad fit that rings: that is judged, and far behind
-    rings = [e.values["damping"] for one in found.judged for e in one.added if e.name == "plant.resonance"]
+    every = [*found.judged, *again.judged]
+    rings = [e.values["damping"] for one in every for e in one.added if e.name == "plant.resonance"]
     assert all(damping < 1.0 for damping in rings), rings
     assert set(found.chosen.names) == {"actuator.lag", "sensor.lag"}
     lags = {e.name: e.parameters["time_constant"].value for e in found.chosen.fit.model.effects}

@@ -51,15 +51,3 @@ def test_numbers_that_are_far_off_do_not_hold_an_effect_back_that_leaves_noise()
     found = search_chain(lag(1.0), [part], readings, known=[whole])
     assert found.chosen.names == whole.names
     assert found.chosen.error * np.nanstd(part.y) == pytest.approx(NOISE, rel=0.1)
-
-
-def test_what_a_search_missed_is_judged_from_where_other_rows_found_it():
-    recording = limited()
-    missed = search_chain(lag(1.0), [recording], good(recording), left_out=[kind.name for kind in ALL])
-    there = recording.read_from(160)
-    part = search_chain(lag(1.0), [there], [np.isfinite(there.y)], left_out=OTHERS)
-    heard = missed.hearing([part.chosen])
-    assert (missed.best.names, heard.best.names) == ((), ("actuator.saturation",))
-    assert heard.best.error * np.std(recording.y) == pytest.approx(NOISE, rel=0.1)
-    assert heard.judged[:-1] == missed.judged
-    assert missed.hearing([]).best is missed.best
