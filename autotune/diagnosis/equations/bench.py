@@ -107,7 +107,15 @@ class Bench(ABC):
         """Return the model fitted with effects, from where another fit ended."""
 
     def refitted(self, outcome: Outcome, iterations: int) -> Outcome:
-        """Return a fit to other rows fitted to these, from its numbers."""
+        """Return a fit to other rows fitted to these, from its numbers.
+
+        Parameters
+        ----------
+        outcome : Outcome
+            The fit to other rows.
+        iterations : int
+            Gauss-Newton steps at most.
+        """
         return self.fitted(outcome.effects, outcome, iterations)
 
     @abstractmethod

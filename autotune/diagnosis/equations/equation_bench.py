@@ -274,7 +274,13 @@ class EquationBench(Bench):
         return self._outcome(outcome.effects, found)
 
     def refitted(self, outcome: Outcome, iterations: int) -> Outcome:
-        """Return a fit to other rows fitted to these, from its numbers: start states are those of these rows."""
+        """Return a fit to other rows fitted to these, from its numbers: start states are those of these rows.
+
+        Parameters
+        ----------
+        outcome, iterations
+            As of :meth:`Bench.refitted`.
+        """
         compiled = self._compiled(outcome.effects)
         z = self._start(compiled, outcome)
         found = fit(compiled, self.recordings, z=z, horizon_s=self.length_s, iterations=LEAST_SOUGHT)
