@@ -93,17 +93,18 @@ def diagnose(
     if columns := evidence.misread_columns():
         return _diagnosis(evidence.keeping(()), columns)
     alone = evidence.keeping(likely(said_by(evidence)))
-    if not found_effects(alone, judged(alone)):
-        return _diagnosis(alone.keeping(()), said=said_by(alone))
+    said_alone, found = said_by(alone), found_effects(alone, judged(alone))
+    if not found:
+        return _diagnosis(alone.keeping(()), said=said_alone)
     parts = parts_of(recordings, LEAST_ROWS)
     progress("once more on parts of the rows", WHOLE)
     said_there = [_said_on(part, alone) for part in parts]
-    begins = {e.name: _begins(e, recordings) for e in found_effects(alone, judged(alone))}
-    said = agreement(said_by(alone), begins, parts, said_there, 0.0, thresholds)
+    begins = {e.name: _begins(e, recordings) for e in found}
+    said = agreement(said_alone, begins, parts, said_there, 0.0, thresholds)
     agreed = evidence.keeping(likely(said))
     # what no part agrees on was found all the same, and may be what follows y whatever the command does
-    found = agreed if judged(agreed) == "effect" else alone
-    if judged(agreed) != "unexplained" and (unheeded := found.unheeded_commands()):
+    explains = agreed if judged(agreed) == "effect" else alone
+    if judged(agreed) != "unexplained" and (unheeded := explains.unheeded_commands()):
         return _diagnosis(agreed.keeping(()), unheeded)
     return _diagnosis(agreed, said=said, kept=likely(said))
 

@@ -64,7 +64,7 @@ def shared_name(name: str) -> str:
 
 def forms_of(names: Iterable[str]) -> frozenset[str]:
     """Return effects by one name for all forms of each: the one that it includes, or that none can tell from it."""
-    return frozenset(shared_name(min((name, *KINDS[name].includes), key=lambda n: n == name)) for name in names)
+    return frozenset(shared_name(next(iter(KINDS[name].includes), name)) for name in names)
 
 
 def related_effects(names: Iterable[str]) -> set[str]:

@@ -241,7 +241,7 @@ class EquationBench(Bench):
         """Return a fit to short windows carried on to long ones."""
         outcome = self._inner(outcome.effects, outcome, LENGTHENED)
         for share in LONGER_AND_LONGER:
-            outcome = self._on(outcome, share * self.length_s, LENGTHENED)
+            outcome = self._on(outcome, share * self.length_s, LENGTHENED, outcome.fitted.windows)
         return outcome
 
     def part(self, outcome: Outcome, rows: int) -> tuple[Bench, Outcome] | None:
@@ -264,13 +264,15 @@ class EquationBench(Bench):
 
     def carried(self, outcome: Outcome, iterations: int) -> Outcome:
         """Return a fit to a part of the rows carried on to all of them."""
-        return self._on(outcome, self.length_s, iterations)
+        return self._on(outcome, self.length_s, iterations, outcome.fitted.windows)
 
-    def _on(self, outcome: Outcome, length_s: float, iterations: int) -> Outcome:
-        """Return the same effects fitted on windows of a length, from where a fit is, its states taken over."""
+    def _on(
+        self, outcome: Outcome, length_s: float, iterations: int, known: Sequence[Windows] | None = None
+    ) -> Outcome:
+        """Return the same effects fitted on windows of a length, from a fit's numbers and states that are known."""
         compiled = self._compiled(outcome.effects)
-        found = fit(compiled, self.recordings, z=self._start(compiled, outcome), known=outcome.fitted.windows,
-                    horizon_s=length_s, iterations=iterations)  # fmt: skip
+        found = fit(compiled, self.recordings, z=self._start(compiled, outcome), known=known, horizon_s=length_s,
+                    iterations=iterations)  # fmt: skip
         return self._outcome(outcome.effects, found)
 
     def refitted(self, outcome: Outcome, iterations: int) -> Outcome:
@@ -281,10 +283,7 @@ class EquationBench(Bench):
         outcome, iterations
             As of :meth:`Bench.refitted`.
         """
-        compiled = self._compiled(outcome.effects)
-        z = self._start(compiled, outcome)
-        found = fit(compiled, self.recordings, z=z, horizon_s=self.length_s, iterations=LEAST_SOUGHT)
-        return self.fitted(outcome.effects, self._outcome(outcome.effects, found), iterations)
+        return self.fitted(outcome.effects, self._on(outcome, self.length_s, LEAST_SOUGHT), iterations)
 
     def is_sought_outside(self, effect: Effect) -> bool:
         """Whether a direct search around the fits seeks one of the effect's numbers."""
