@@ -1,11 +1,13 @@
 """The linear chain in state space, arranged so that physics can be put into it.
 
 Every first-order block's state is its output, so that speed, position and level are states; blocks of higher order
-are in controllable form. Forces enter at the input of the first plant block, in that input's unit.
+are in controllable form, the first state in the unit of the output. Positions and levels are in the unit of the
+reading, whatever gain the sensor has. Forces enter at the input of the first plant block, in that input's unit.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -37,7 +39,7 @@ class Chain:
         Gain of the first plant block from force to speed or level, of the last plant block, direct gain from command
         to plant input and from command to output.
     where : (3,) int array
-        State numbers of actuator lag, speed and position, -1 where there is none.
+        State numbers of actuator lag (in the command's unit), speed and position, -1 where there is none.
     levels : int
         Number of levels, one above the other; 0 where the plant has a speed.
     delay_s : float
@@ -108,14 +110,16 @@ def _realise(block: Block) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     num[den.size - len(block.dynamics.num) :] = np.asarray(block.dynamics.num) / block.dynamics.den[0]
     n = den.size - 1
     direct = float(num[0])
-    rest = num[1:] - direct * den[1:]
+    c = (num[1:] - direct * den[1:])[::-1]
     A = np.zeros((n, n))
     b = np.zeros(n)
     if n:
         A[:-1, 1:] = np.eye(n - 1)
         A[-1] = -den[:0:-1]
-        b[-1] = 1.0
-    return A, b, rest[::-1].copy(), direct
+        # a stop holds a state where readings say: the first state is the output, and not this over the gain
+        b[-1] = c[0] if c[0] != 0.0 else 1.0
+        c = c / b[-1]
+    return A, b, c.copy(), direct
 
 
 def _realise_first_order(dynamics: TransferFunction) -> tuple[FloatArray, FloatArray, FloatArray, float]:
@@ -164,6 +168,7 @@ def chain_of(blocks: tuple[Block, ...], name: str) -> Chain:
     if not 1 <= order <= 12:
         raise InputError(f"the chain has {order} states", where=name, remedy="diagnosis handles 1 to 12 states")
     plant, law = _plant_blocks(blocks), _law(blocks)
+    blocks = blocks if law is not None else _in_readings(blocks, plant[-1])
     A, B = np.zeros((order, order)), np.zeros((order, kernel.INPUTS))
     signals, edges = _arranged(blocks, plant, law, A, B)
     taps = signals.taps
@@ -195,9 +200,15 @@ def _arranged(
     )
     taps, gains = signals.taps, signals.gains
     row, direct, at, edges = np.zeros(order), np.array([1.0, 0.0, 0.0]), 0, (order, 0)
+    commanded = 1.0  # gain from the command to the present block's input, at rest
     for number, block in enumerate(blocks):
         a, b, c, d = _realise(block)
         n = b.size
+        rests = -b[0] / a[0, 0] * commanded if n == 1 and a[0, 0] != 0.0 else 0.0
+        if block.place == "actuator" and rests != 0.0 and number < plant[0] and signals.where[ACTUATOR] < 0:
+            # which way a lag goes is told by the command beside its state: both in the command's unit
+            b, c, signals.where[ACTUATOR] = b / rests, c * rests, at
+        commanded *= block.dynamics.num[-1] / block.dynamics.den[-1] if block.dynamics.den[-1] != 0.0 else 0.0
         if number == plant[0]:
             taps[kernel.PLANT_IN], gains[2] = row, direct[0]
             direct[1] = 1.0
@@ -214,8 +225,6 @@ def _arranged(
         if number in plant:
             _note_signals(signals, block, (number == plant[0], number == plant[-1]), at, c, row)
             edges = (min(edges[0], at), at + n)
-        if block.place == "actuator" and n == 1 and number < plant[0] and signals.where[ACTUATOR] < 0:
-            signals.where[ACTUATOR] = at
         at += n
         if number == law:
             taps[kernel.PLANT_IN], gains[2] = before
@@ -235,6 +244,24 @@ def _plant_blocks(blocks: Sequence[Block]) -> list[int]:
         return float("inf") if den[-1] == 0.0 else abs(den[0] / den[-1]) ** (1.0 / (len(den) - 1))
 
     return plant or [max(dynamic, key=slowness)]
+
+
+def _in_readings(blocks: tuple[Block, ...], last: int) -> tuple[Block, ...]:
+    """Return blocks with the static gain of those behind the plant put into the plant's last one.
+
+    From command to reading the chain is the same; position and level are in the reading's unit, as effects are.
+    """
+    behind = [block.dynamics for block in blocks[last + 1 :]]
+    gain = math.prod(d.num[-1] / d.den[-1] if d.den[-1] != 0.0 else 0.0 for d in behind)
+    if gain in (0.0, 1.0):
+        return blocks
+    return (*blocks[:last], _amplified(blocks[last], gain), _amplified(blocks[last + 1], 1.0 / gain),
+            *blocks[last + 2 :])  # fmt: skip
+
+
+def _amplified(block: Block, gain: float) -> Block:
+    """Return a block with another gain."""
+    return replace(block, dynamics=replace(block.dynamics, num=tuple(gain * c for c in block.dynamics.num)))
 
 
 def _law(blocks: Sequence[Block]) -> int | None:

@@ -96,6 +96,21 @@ def test_a_position_never_passes_a_hard_stop(limit: float) -> None:
     assert out[:, 0].max() == pytest.approx(limit, abs=1e-12)
 
 
+@given(gain=st.floats(0.01, 300.0), sensed=st.sampled_from((-0.05, 0.05, 1.0, 40.0)), low=st.floats(-2.0, -0.1))
+@settings(max_examples=20)
+def test_stops_are_where_readings_say_whatever_the_gains_of_plant_and_sensor(
+    gain: float, sensed: float, low: float
+) -> None:
+    stops, high = effect("plant.hard_stop", low=low, high=1.0), 1.0
+    plant = Block(name="ball", place="plant", dynamics=TransferFunction(num=(gain,), den=(1.0, 0.5, 0.0)))
+    sensor = Block(name="sensor", place="sensor", dynamics=TransferFunction(num=(sensed,), den=(1.0,)))
+    tube = Model(name="tube", input=Port(), output=Port(), blocks=(plant, sensor), effects=(stops,))
+    there_and_back = np.repeat([1.0, -1.0, 1.0], 40) * 3.0 / abs(gain * sensed)
+    out, _ = assemble(tube).run(recording(there_and_back, 0.1), np.zeros(2))
+    assert out[:, 0].max() == pytest.approx(high, abs=1e-9)
+    assert out[:, 0].min() == pytest.approx(low, abs=1e-9)
+
+
 def test_windows_that_start_where_the_one_before_ended_are_one_free_run() -> None:
     rng = np.random.default_rng(3)
     r = recording(np.repeat(rng.normal(size=40), 20), 0.005)
