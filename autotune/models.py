@@ -22,6 +22,9 @@ Place: TypeAlias = Literal["actuator", "plant", "sensor"]
 #: What a speed is called, and its units.
 _SPEED = re.compile(r"speed|velocity|\brpm\b")
 _SPEED_UNIT = re.compile(r"^(m|mm|cm|km|rad|deg|°|rev|turns?)/(s|min|h)$|^rpm$|^1/min$")
+#: Units of temperatures, and what is heated or filled is called.
+TEMPERATURE_UNITS = ("degc", "\N{DEGREE SIGN}c", "k", "degf", "c", "celsius")
+HEATED, FILLED = re.compile(r"temperature|heater|heated|oven|furnace"), re.compile(r"\btanks?\b|\blevel\b")
 Hold: TypeAlias = Literal["zero", "linear"]
 
 #: Most blocks of a chain and most coefficients of a polynomial: far beyond any plant, far before work becomes a wait.
@@ -169,6 +172,12 @@ class Block:
         """Whether the output of a first-order block is a speed, by its name or unit."""
         said = f"{self.name} {self.output}".lower()
         return len(self.dynamics.den) == 2 and bool(_SPEED.search(said) or _SPEED_UNIT.search(self.unit.lower()))
+
+    @property
+    def is_stored(self) -> bool:
+        """Whether the output is what is stored, heat or a level, by its unit or name: nothing moves there."""
+        said = f"{self.name} {self.output}".lower()
+        return self.unit.strip().lower() in TEMPERATURE_UNITS or bool(HEATED.search(said) or FILLED.search(said))
 
 
 @dataclass(frozen=True, kw_only=True)

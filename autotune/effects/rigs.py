@@ -6,7 +6,7 @@ import re
 from typing import Literal, TypeAlias
 
 from autotune.effects.base import Chain
-from autotune.models import Model
+from autotune.models import FILLED, HEATED, TEMPERATURE_UNITS, Model
 
 #: ``arm``: an angle that gravity or a spring pulls back; ``shaft``: an angle that nothing does; ``carriage``: a
 #: position; ``lifted``: a body that floats; ``speed``: a drive whose speed is measured; ``oscillator``: any other mode
@@ -16,7 +16,6 @@ RigKind: TypeAlias = Literal[
     "arm", "shaft", "carriage", "lifted", "speed", "oscillator", "level", "thermal", "valve", "damper", "process"
 ]
 _ANGLES = ("rad", "deg", "\N{DEGREE SIGN}")
-_TEMPERATURES = ("degc", "\N{DEGREE SIGN}c", "k", "degf", "c", "celsius")
 
 
 def rig_kind(model: Model, chain: Chain) -> RigKind:
@@ -41,10 +40,10 @@ def rig_kind(model: Model, chain: Chain) -> RigKind:
         return "oscillator"
     if chain.is_mechanical:
         return "speed"
-    if unit in _TEMPERATURES or re.search(r"temperature|heater|heated|oven|furnace", said):
+    if unit in TEMPERATURE_UNITS or HEATED.search(said):
         return "thermal"
     if re.search(r"\bvalve\b|\bflow\b|\bpressure\b", said):
         return "valve"
-    if re.search(r"\btanks?\b|\blevel\b", said):
+    if FILLED.search(said):
         return "level"
     return "process"

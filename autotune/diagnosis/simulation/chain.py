@@ -299,7 +299,7 @@ def _note_signals(
         taps[kernel.FIRST_LEVEL] = row
         if n == 1 and last and block.is_speed:
             taps[kernel.SPEED], where[SPEED] = row, at
-        if n == 2 and last and c[0] != 0.0:
+        if n == 2 and last and c[0] != 0.0 and not block.is_stored:
             taps[kernel.SPEED, at + 1] = c[0]
             where[SPEED] = at + 1
             where[POSITION] = at

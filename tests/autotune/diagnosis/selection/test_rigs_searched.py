@@ -99,8 +99,10 @@ def test_a_linear_oscillation_is_given_no_effect():
     [
         ("rad", (1.0, 0.2, 20.0), "angle", "arm"),
         ("degC", (300.0, 1.0), "temperature", "thermal"),
+        ("degC", (27.0, 36.75, 1.0), "temperature", "thermal"),
         ("m/s", (1.0, 2.0), "speed", "speed"),
         ("cm", (60.0, 1.0), "level", "level"),
+        ("cm", (600.0, 70.0, 1.0), "level", "level"),
         ("V", (1.0, 40.0, 190000.0), "voltage", "oscillator"),
         ("", (5.0, 1.0), "", "process"),
     ],
