@@ -136,9 +136,9 @@ def rising(x: float, gain: float, coefficient: float) -> float:
     return -(coefficient * x * abs(x) / gain)
 
 
-def _held_back(turned: float, amplitude: float) -> float:
-    """Return the force of a hysteresis."""
-    return -(amplitude * turned)
+def _held_back(turned: float, gain: float, amplitude: float) -> float:
+    """Return the force of a hysteresis, against the travel whichever way a command moves the plant."""
+    return -(math.copysign(amplitude, gain) * turned)
 
 
 def turn(dx: float, width: float, turned: float) -> float:

@@ -31,9 +31,9 @@ def with_effect(name: str, gain_of_forces: float = 1.0) -> Model:
     return replace(chain, effects=(Effect(name=name, parameters=MappingProxyType(parameters)),))
 
 
-def reading(model: Model) -> np.ndarray:
+def reading(model: Model, u: np.ndarray = U) -> np.ndarray:
     sim = assemble(model)
-    rows = Recording(t=np.arange(601.0), u=U[:601], y=np.zeros(601))
+    rows = Recording(t=np.arange(601.0), u=u[:601], y=np.zeros(601))
     return np.asarray(sim.run(rows, np.zeros(sim.order), signals=1)[0][:, 0])
 
 
@@ -58,3 +58,12 @@ def test_an_effect_is_the_same_behind_an_actuator_of_another_gain(name: str, gai
     valve, plant, *others = model.blocks
     blocks = (amplified(valve, gain), amplified(plant, 1.0 / gain), *others)
     assert_same(reading(replace(model, blocks=blocks)), reading(with_effect(name)))
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if name.startswith("plant.")])
+def test_an_effect_of_the_plant_is_the_same_where_commands_move_it_the_other_way(name: str) -> None:
+    signed = any(q.unit.startswith("{f}") and q.sign == "real" for q in kind_of(name).parameters)
+    model, u = with_effect(name, -1.0 if signed else 1.0), 2.0 * CASES[name][0].input.offset - U
+    first = next(i for i, block in enumerate(model.blocks) if block.place == "plant")
+    blocks = (*model.blocks[:first], amplified(model.blocks[first], -1.0), *model.blocks[first + 1 :])
+    assert_same(reading(replace(model, blocks=blocks), u), reading(with_effect(name)))
