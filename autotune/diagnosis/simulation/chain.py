@@ -292,7 +292,8 @@ def _note_signals(
     """
     (first, last), (taps, gains, where) = ends, (signals.taps, signals.gains, signals.where)
     den, n = block.dynamics.den, c.size
-    static = block.dynamics.num[-1] / den[-1] if den[-1] != 0.0 else block.dynamics.num[-1] / den[0]
+    # of what integrates, the gain to what it integrates: to the speed, written as one block or as two
+    static = block.dynamics.num[-1] / next(c for c in reversed(den) if c != 0.0)
     static = static or 1.0  # a plant without static gain, as a derivative: forces count as they come out
     if first:
         gains[0] = static

@@ -10,7 +10,7 @@ import pytest
 
 from autotune.diagnosis.simulation.assembly import assemble
 from autotune.effects import kind_of
-from autotune.models import Block, Effect, Model, Parameter, TransferFunction
+from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.recording import Recording
 from tests.autotune.diagnosis.simulation.test_chain_fmu import CASES, U
 
@@ -67,3 +67,31 @@ def test_an_effect_of_the_plant_is_the_same_where_commands_move_it_the_other_way
     first = next(i for i, block in enumerate(model.blocks) if block.place == "plant")
     blocks = (*model.blocks[:first], amplified(model.blocks[first], -1.0), *model.blocks[first + 1 :])
     assert_same(reading(replace(model, blocks=blocks), u), reading(with_effect(name)))
+
+
+def carriage(*plant: Block) -> Model:
+    valve = Block(name="drive", place="actuator", dynamics=TransferFunction(num=(1.0,), den=(2.0, 1.0)))
+    return Model(name="carriage", input=Port(unit="V"), output=Port(unit="rad"), blocks=(valve, *plant))
+
+
+def of_plant(num: tuple[float, ...], den: tuple[float, ...], unit: str) -> Block:
+    return Block(name="plant", place="plant", dynamics=TransferFunction(num=num, den=den), unit=unit)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        (n, v)
+        for n, (_, v) in CASES.items()
+        if n not in ("plant.radiation_loss", "plant.nonlinear_loss", "plant.sqrt_outflow")
+    ],
+)
+def test_an_effect_is_the_same_in_a_plant_written_as_one_block_or_as_speed_and_position(
+    name: str, values: dict[str, float]
+) -> None:
+    effect = Effect(name=name, parameters=MappingProxyType({k: Parameter(value=v) for k, v in values.items()}))
+    as_two = carriage(of_plant((0.3,), (8.0, 1.0), "rad/s"), of_plant((1.0,), (1.0, 0.0), "rad"))
+    as_one = carriage(of_plant((0.3,), (8.0, 1.0, 0.0), "rad"))
+    u = U - np.mean(U)
+    one, two = (reading(replace(model, effects=(effect,)), u) for model in (as_one, as_two))
+    assert_same(one, two)
