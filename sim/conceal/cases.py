@@ -14,7 +14,7 @@ from sim.conceal.effects import PROCESS
 from sim.conceal.physics import Floats, Physics
 from sim.conceal.record import Record, record, scale_of, size_effects
 from sim.conceal.retune import Chain, forecast_error, residuals, retune
-from sim.conceal.rigs import linear_truth, model_file
+from sim.conceal.rigs import FORMS, linear_truth, model_file
 from sim.conceal.sizes import Scale, Sized
 from sim.whole import write_text
 
@@ -171,7 +171,7 @@ def write(seed: int, folder: Path, answer_file: Path) -> dict[str, Any]:
         For the answer, elsewhere.
     """
     d, records, answer = make(seed)
-    write_text(folder / "model.toml", model_file(d.rig))
+    write_text(folder / "model.toml", model_file(d.rig, FORMS[seed % len(FORMS)]))
     digits = 1 if d.rig.rig == PROCESS else 3
     for name, ex, r in zip(FILES, d.excitations, records, strict=True):
         columns = [r.u, r.y, *([r.r] if ex.record_r else [])]

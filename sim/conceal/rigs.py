@@ -11,6 +11,10 @@ from sim.conceal.effects import BALL, PROCESS, SERVO
 from sim.conceal.physics import Physics
 from sim.conceal.retune import Chain
 
+#: How a model may be written, and what a sensor shows of one unit where it has a gain.
+FORMS = ("blocks", "one block", "gain in the sensor")
+SENSED = 2.5
+
 
 @dataclass(frozen=True, kw_only=True)
 class NominalRig:
@@ -185,8 +189,17 @@ def linear_truth(p: Physics) -> Chain:
     )
 
 
-def model_file(rig: NominalRig) -> str:
-    """Nominal model in the project's model format."""
+def model_file(rig: NominalRig, form: str = "blocks") -> str:
+    """Nominal model in the project's model format.
+
+    Parameters
+    ----------
+    rig : NominalRig
+        What is written.
+    form : str
+        One of ``FORMS``: an engineer may write speed and position as one block of second order, or leave the gain to
+        the sensor. The chain from command to reading is the same.
+    """
     chain = rig.chain
     actuator, body, position, sensor = rig.blocks
     speed = {BALL: "speed", SERVO: "speed", PROCESS: rig.output}[rig.rig]
@@ -198,11 +211,17 @@ def model_file(rig: NominalRig) -> str:
     if chain.delay > 0.0:
         blocks[0].append(("delay", chain.delay))
     blocks[1] += [("output", speed), ("unit", speed_unit)]
-    if chain.integrating:
+    if chain.integrating and form == "one block":
+        blocks[1] = [("name", position), ("place", "plant"), ("num", [chain.K]), ("den", [chain.tau_plant, 1, 0])]
+        blocks[1] += [("output", rig.output), ("unit", rig.unit_y)]
+    elif chain.integrating:
         integrator: list[tuple[str, Any]] = [("name", position), ("place", "plant"), ("num", [1]), ("den", [1, 0])]
         blocks.append([*integrator, ("output", rig.output), ("unit", rig.unit_y)])
     last = [chain.tau_sensor, 1] if chain.tau_sensor > 0.0 else [1]
     blocks.append([("name", sensor), ("place", "sensor"), ("num", [1]), ("den", last)])
+    if form == "gain in the sensor":
+        blocks[1][2], blocks[-1][2] = ("num", [chain.K / SENSED]), ("num", [SENSED])
+        blocks[1:-1] = [[(key, value) for key, value in block if key != "unit"] for block in blocks[1:-1]]
     lines = [f'name = "{rig.name}"']
     lines += ["[input]", f'unit = "{rig.unit_u}"', f"offset = {chain.u_offset:g}"]
     lines += ["[output]", f'unit = "{rig.unit_y}"', f"offset = {chain.y_offset:g}"]
