@@ -257,6 +257,14 @@ class Model:
         """Unit of the plant's input: an actuator's output as far as one is stated, else the command's."""
         return next((b.unit for b in self.blocks if b.place == "actuator" and b.unit), self.input.unit)
 
+    @property
+    def speed_unit(self) -> str:
+        """Unit of the plant's speed: the reading's own where a speed is read, empty where it has none."""
+        unit = self.output.unit
+        plant = [b for b in self.blocks if b.place == "plant" and len(b.dynamics.den) > 1]
+        is_read = bool(_SPEED_UNIT.search(unit.lower())) or (plant != [] and plant[-1].is_speed)
+        return unit if is_read or not unit else f"{unit}/s"
+
     def response(self, omega_rad_s: FloatArray) -> ComplexArray:
         """Return the complex gain from u to y, effects left out, same shape as ``omega_rad_s``."""
         product = np.ones_like(np.asarray(omega_rad_s), dtype=np.complex128)

@@ -217,7 +217,7 @@ def _title(name: str, found: Diagnosis) -> str:
     """Return the title of a signal's axis, with its unit."""
     model, (u, y) = found.search.retuned.fit.model, found.search.units
     units = {"command u": u, "command": u, "u_applied": u, "plant input": model.plant_input_unit}
-    units |= {"reading": y, "position": y, "level": y, "speed": f"{y}/s", "rate of the reading": f"{y}/s"}
+    units |= {"reading": y, "position": y, "level": y, "speed": model.speed_unit, "rate of the reading": f"{y}/s"}
     return f"{name} [{units.get(name) or '-'}]" if name in units else name
 
 

@@ -140,3 +140,17 @@ def test_parameters_of_unknown_standard_deviation_are_equal_and_one_in_a_set() -
     assert len({one, other}) == 1
     assert one != Parameter(value=0.2, unit="V", sd=0.1)
     assert one != Parameter(value=0.2, unit="A")
+
+
+@pytest.mark.parametrize(
+    ("unit", "output", "den", "speed"),
+    [
+        ("rad/s", "", (0.2, 1.0), "rad/s"),
+        ("V", "speed", (0.2, 1.0), "V"),
+        ("mm", "position", (0.2, 1.0, 0.0), "mm/s"),
+        ("", "", (0.2, 1.0, 3.0), ""),
+    ],
+)
+def test_a_speed_that_is_read_has_the_readings_unit(unit: str, output: str, den: tuple[float, ...], speed: str) -> None:
+    plant = Block(name="plant", place="plant", dynamics=TransferFunction(num=(1.0,), den=den), output=output)
+    assert Model(name="rig", input=Port(unit="V"), output=Port(unit=unit), blocks=(plant,)).speed_unit == speed

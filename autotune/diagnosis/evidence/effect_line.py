@@ -112,7 +112,6 @@ class EffectLine(LawLine):
     def unit(self) -> str:
         """Unit of the signal."""
         model = self.result.parametrisation.model
-        y = model.output.unit
         match self.signal:
             case "time":
                 return "s"
@@ -121,11 +120,9 @@ class EffectLine(LawLine):
             case "plant input":
                 return model.plant_input_unit
             case "speed":
-                return next(
-                    (b.unit for b in model.blocks if b.unit and b.output.lower() in ("speed", "velocity")), f"{y}/s"
-                )
+                return model.speed_unit
             case _:
-                return y
+                return model.output.unit
 
     @property
     def turns_round(self) -> bool:
