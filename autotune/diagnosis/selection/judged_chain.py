@@ -127,7 +127,7 @@ def at_both_scales(one: JudgedChain, found: Sequence[JudgedChain]) -> JudgedChai
     residual, from those numbers of the same hypothesis, wherever they were found, that suit both best: fits under dry
     friction end in local minima.
     """
-    if one.few is one.data or not one.fit.model.transfer_function().integrators:
+    if one.few is one.data:
         return one
     p, held = one.fit.parametrisation, np.zeros(one.fit.theta.size, dtype=bool)
     both = one.data.beside(one.few)

@@ -131,12 +131,13 @@ def search(proposals: Proposals[_J], progress: Progress = quiet, known: Sequence
     stretches agree on it: what is excited in no stretch but one is found with less power.
     """
     if known is not None:
-        at, found = proposals, [proposals.roots[0], *proposals.refitted(known)]
+        found = [proposals.roots[0], *proposals.refitted(known)]
+        chosen = rank(found)[0]
     else:
         at, found = _grow(proposals, progress)
         found = _prune(at, found)
         found += at.finish_leading(found)
-    chosen = at.settle_numbers(rank(found)[0], found)
+        chosen = at.settle_numbers(rank(found)[0], found)
     retuned = chosen if not chosen.names else rank([one for one in found if not one.names])[0]
     nominal, retuned, chosen = (one.spread_out() for one in (proposals.nominal, retuned, chosen))
     return Found(nominal=nominal, retuned=retuned, judged=tuple(found), best=chosen, chosen=chosen)
