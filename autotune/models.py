@@ -258,6 +258,13 @@ class Model:
         return next((b.unit for b in self.blocks if b.place == "actuator" and b.unit), self.input.unit)
 
     @property
+    def force_unit(self) -> str:
+        """Unit of the plant's forces: of its input, or of the reading where the plant is a law without dynamics."""
+        plant = [b for b in self.blocks if b.place == "plant"]
+        is_law = plant != [] and all(len(b.dynamics.den) == 1 for b in plant)
+        return self.output.unit if is_law else self.plant_input_unit
+
+    @property
     def speed_unit(self) -> str:
         """Unit of the plant's speed: the reading's own where a speed is read, empty where it has none."""
         unit = self.output.unit

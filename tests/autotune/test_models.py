@@ -154,3 +154,11 @@ def test_parameters_of_unknown_standard_deviation_are_equal_and_one_in_a_set() -
 def test_a_speed_that_is_read_has_the_readings_unit(unit: str, output: str, den: tuple[float, ...], speed: str) -> None:
     plant = Block(name="plant", place="plant", dynamics=TransferFunction(num=(1.0,), den=den), output=output)
     assert Model(name="rig", input=Port(unit="V"), output=Port(unit=unit), blocks=(plant,)).speed_unit == speed
+
+
+@pytest.mark.parametrize(("den", "force"), [((1.0,), "kN"), ((0.2, 1.0), "V")])
+def test_the_force_of_a_damper_is_what_is_read_and_that_of_a_drive_its_command(
+    den: tuple[float, ...], force: str
+) -> None:
+    plant = Block(name="plant", place="plant", dynamics=TransferFunction(num=(1.0,), den=den))
+    assert Model(name="rig", input=Port(unit="V"), output=Port(unit="kN"), blocks=(plant,)).force_unit == force

@@ -1,8 +1,4 @@
-"""Other minima of a fit with dry friction: where a plant that rests begins to move or not, levels lie between them.
-
-Each rest that holds, or does not, is another piece of the squared error over the level: a descent ends in the piece
-where it began, and the curvature there says nothing of the next.
-"""
+"""Fits of equations with dry friction: from other levels, and which of their minima is taken."""
 
 from __future__ import annotations
 
@@ -15,12 +11,11 @@ import numpy as np
 from autotune.diagnosis.equations.bench import Bench, Outcome
 from autotune.diagnosis.equations.candidates import form_of
 from autotune.diagnosis.equations.scores import attempt
+from autotune.diagnosis.fitting.levels import sweep
 from autotune.models import Effect
 
-#: From one level to the next, in each direction so many at most, each with so many iterations.
-FACTOR, LEVELS, ITERATIONS = 1.5, 4, 8
-#: Times the least squared error, from which on a direction is left.
-TOO_FAR = 1.2
+#: Iterations of a fit from one level to the next.
+ITERATIONS = 8
 
 
 def with_force(effect: Effect, times: float) -> Effect:
@@ -30,32 +25,20 @@ def with_force(effect: Effect, times: float) -> Effect:
 
 
 def sweep_levels(bench: Bench, one: Outcome) -> list[Outcome]:
-    """Return a fit with dry friction and those from forces above and below it, each from the one before.
+    """Return a fit and, where it has dry friction, those from forces above and below it.
 
     Parameters
     ----------
-    bench : Bench
-        The model on its recordings.
-    one : Outcome
-        Where to begin.
-
-    Returns
-    -------
-    list of Outcome
-        The one given first; what runs away, or leaves far more than the best, ends a direction.
+    bench, one
+        The model on its recordings; where to begin.
     """
-    found = [one]
     if not any(form_of(effect).levels for effect in one.effects):
-        return found
-    for factor in (FACTOR, 1.0 / FACTOR):
-        at: Outcome | None = min(found, key=lambda other: other.rss)
-        for _ in range(LEVELS):
-            assert at is not None
-            at = attempt(bench, [with_force(effect, factor) for effect in at.effects], at, ITERATIONS)
-            if at is None or at.rss > TOO_FAR * min(other.rss for other in found):
-                break
-            found.append(at)
-    return found
+        return [one]
+
+    def fitted_at(at: Outcome, factor: float) -> Outcome | None:
+        return attempt(bench, [with_force(effect, factor) for effect in at.effects], at, ITERATIONS)
+
+    return sweep(one, fitted_at, lambda other: other.rss)
 
 
 def select_minimum(bench: Bench, fits: Sequence[Outcome], rows: float, ratio: float) -> Outcome:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -15,6 +16,7 @@ from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.stretches import error_beside_still, judged_rows, rms
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, fit_from, residual_at
+from autotune.diagnosis.fitting.levels import sweep
 from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.retuning import reduced_chi2, under_noise
 from autotune.diagnosis.fitting.spreading import spread_out
@@ -24,6 +26,7 @@ from autotune.diagnosis.selection.prediction import extend
 from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.selection.searched import Search
 from autotune.diagnosis.thresholds import Thresholds
+from autotune.effects import kind_of
 from autotune.models import Effect
 
 
@@ -124,8 +127,8 @@ def at_both_scales(one: JudgedChain, found: Sequence[JudgedChain]) -> JudgedChai
 
     What a plant that integrates lacks piles up in a long run and bends its numbers along a valley that the long run
     hardly sees; short windows see it, and are bent otherwise. So both are fitted at once, each in units of its own
-    residual, from those numbers of the same hypothesis, wherever they were found, that suit both best: fits under dry
-    friction end in local minima.
+    residual, from the numbers of the same hypothesis, wherever they were found, and from other levels of dry friction,
+    under which fits end in local minima.
     """
     if one.few is one.data:
         return one
@@ -134,11 +137,36 @@ def at_both_scales(one: JudgedChain, found: Sequence[JudgedChain]) -> JudgedChai
     thetas = (theta for j in found if j.names == one.names for theta in (j.fit.theta, j.short.theta))
     try:
         start = min((fit(p, both, theta, free=held, iterations=STEPS) for theta in thetas), key=lambda f: f.cost)
-        joint = fit(p, both, start.theta, start.x0, iterations=LAST_STEPS)
+        joint = _least_over_levels(fit(p, both, start.theta, start.x0, iterations=STEPS), both)
+        joint = fit(p, both, joint.theta, joint.x0, iterations=LAST_STEPS)
         far = fit_from(p, one.data, joint.theta, iterations=0, rounds=0)  # with the derivatives of all numbers
     except RUNAWAY:
         return one
     return replace(one, fit=replace(far, covariance=joint.covariance))
+
+
+def _least_over_levels(joint: Fit, both: Data) -> Fit:
+    """Return the fit that leaves least, of one and of those from other levels of its dry friction."""
+    p = joint.parametrisation
+    levels = [i for i, f in enumerate(p.free) if f.kind == "effect" and _is_level(f.name)]
+    if not levels:
+        return joint
+
+    def fitted_at(at: Fit, factor: float) -> Fit | None:
+        theta = at.theta.copy()
+        theta[levels] += math.log(factor)
+        with suppress(*RUNAWAY):
+            return fit(p, both, theta, at.x0, iterations=STEPS)
+        return None
+
+    return min(sweep(joint, fitted_at, lambda other: other.cost), key=lambda other: other.cost)
+
+
+def _is_level(name: str) -> bool:
+    """Whether a number of an effect is a level of dry friction."""
+    effect, _, number = name.rpartition(".")
+    form = kind_of(effect).in_equations
+    return form is not None and number in form.levels
 
 
 def as_search(found: Found[JudgedChain]) -> Search:

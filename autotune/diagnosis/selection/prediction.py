@@ -81,7 +81,7 @@ def signal_sizes(base: Fit, data: Data) -> SignalSizes:
 
 def units_of(kind: EffectKind, model: Model) -> list[str]:
     """Return the units of an effect's parameters in a model."""
-    units = {"u": model.input.unit, "y": model.output.unit, "f": model.plant_input_unit, "v": model.speed_unit}
+    units = {"u": model.input.unit, "y": model.output.unit, "f": model.force_unit, "v": model.speed_unit}
     return [q.unit.format(**units) for q in kind.parameters]
 
 

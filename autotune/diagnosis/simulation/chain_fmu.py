@@ -90,7 +90,7 @@ def left_out_of_fmu(model: Model) -> tuple[str, ...]:
 
 
 def _unit(unit: str, model: Model) -> str:
-    return unit.format(u=model.input.unit, f=model.plant_input_unit, v=model.speed_unit, y=model.output.unit)
+    return unit.format(u=model.input.unit, f=model.force_unit, v=model.speed_unit, y=model.output.unit)
 
 
 def _value(sim: Simulator, kind: EffectKind, name: str) -> float:
