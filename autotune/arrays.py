@@ -62,10 +62,13 @@ def principal_axes(covariance: FloatArray) -> FloatArray:
     Returns
     -------
     (P, P) array
-        Its columns are the principal axes where every parameter is measured in its standard deviation.
+        Its columns are the principal axes where every parameter is measured in its standard deviation, each with its
+        largest entry positive: an axis has no sign, and the last digit must not choose one.
     """
     scale = _deviations(covariance)
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    largest = np.take_along_axis(vectors, np.argmax(np.abs(vectors), axis=0)[None, :], axis=0)
+    vectors = vectors * np.where(largest < 0.0, -1.0, 1.0)
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
 
 

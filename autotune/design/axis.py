@@ -30,19 +30,45 @@ def require_range(*systems: TransferFunction) -> None:
 
 
 def characteristic_frequencies(*systems: TransferFunction) -> FloatArray:
-    """Return magnitudes of nonzero poles, zeros, asymptote crossings of gain 1 and reciprocal delays [rad/s]."""
-    found: list[float] = []
+    """Return magnitudes of nonzero poles, zeros, asymptote crossings of gain 1 and reciprocal delays [rad/s].
+
+    Crossings of gain 1 mean something of a loop; of a plant they depend on its units, see :func:`corner_frequencies`.
+    """
+    crossings: list[float] = []
     for system in systems:
         num, den = np.array(system.num), np.array(system.den)
-        for polynomial in (num, den, np.polyadd(num, den)):
-            # coefficients that are 0 up to rounding would add roots many decades away from the loop
-            found.extend(np.abs(np.roots(polynomial)) if np.any(polynomial) else [])
+        crossings.extend(_roots(np.polyadd(num, den)))
         if np.any(num):
-            found.extend(_unit_gain_asymptotes(num, den))
-        if system.delay_s > 0.0:  # a dead time a million times shorter than all else is no feature
+            crossings.extend(_unit_gain_asymptotes(num, den))
+    values = _sorted([*crossings, *corner_frequencies(*systems, beside=max(crossings, default=0.0))])
+    return values if len(values) else np.array([1.0])
+
+
+def corner_frequencies(*systems: TransferFunction, beside: float = 0.0) -> FloatArray:
+    """Return magnitudes of nonzero poles and zeros, and reciprocal delays [rad/s]: whatever the units of gains.
+
+    Parameters
+    ----------
+    *systems : TransferFunction
+        Time in s.
+    beside : float
+        Another feature [rad/s]; a dead time a million times shorter than all else is none.
+    """
+    found: list[float] = [beside] if beside > 0.0 else []
+    for system in systems:
+        found.extend([*_roots(np.array(system.num)), *_roots(np.array(system.den))])
+        if system.delay_s > 0.0:
             found.append(min(1.0 / system.delay_s, 1e6 * max(found, default=math.inf)))
-    values = np.array([value for value in found if value > 0.0 and math.isfinite(value)])
-    return np.unique(values) if len(values) else np.array([1.0])
+    return _sorted(found)
+
+
+def _roots(polynomial: FloatArray) -> list[float]:
+    """Return magnitudes of roots; none of a polynomial that is 0."""
+    return [float(root) for root in np.abs(np.roots(polynomial))] if np.any(polynomial) else []
+
+
+def _sorted(frequencies: list[float]) -> FloatArray:
+    return np.unique([value for value in frequencies if value > 0.0 and math.isfinite(value)])
 
 
 def _unit_gain_asymptotes(num: FloatArray, den: FloatArray) -> list[float]:

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from autotune.arrays import ComplexArray, FloatArray
-from autotune.design.axis import characteristic_frequencies
+from autotune.design.axis import characteristic_frequencies, corner_frequencies
 from autotune.design.figures import Figures
 from autotune.errors import DesignError
 from autotune.models import TransferFunction
@@ -85,7 +85,10 @@ def sampled_plant(plant: TransferFunction, largest_gain: float = 1.0) -> Sampled
             where="plant",
             remedy="integral action cannot remove a disturbance there; design another structure",
         )
-    loudest = TransferFunction(num=tuple(largest_gain * b for b in plant.num), den=plant.den, delay_s=plant.delay_s)
+    # s den + num K/T_I needs its last coefficient of its first one's sign: necessary with integral action
+    sign = math.copysign(1.0, num[-1] * den[0])
+    most = sign * largest_gain
+    loudest = TransferFunction(num=tuple(most * b for b in plant.num), den=plant.den, delay_s=plant.delay_s)
     corners = characteristic_frequencies(loudest)
     low, high = corners[0] * 1e-4, corners[-1] * 1e2
     if not high < _WIDEST * low:  # also where one of them is not a number
@@ -94,8 +97,8 @@ def sampled_plant(plant: TransferFunction, largest_gain: float = 1.0) -> Sampled
             where="plant",
             remedy="check the model's units and the noise gain that is asked for",
         )
-    # the plant's own grid, whatever the gains: they decide how far it reaches, and no digit of what is read between
-    own = characteristic_frequencies(plant)[0]
+    # the plant's own grid, whatever gains and units: they decide how far it reaches, no digit of what is read between
+    own = min(corner_frequencies(plant), default=corners[0])
     first, last = (_POINTS_PER_DECADE * math.log10(end / own) for end in (low, high))
     omega = own * 10.0 ** (np.arange(math.floor(first), math.ceil(last) + 1) / _POINTS_PER_DECADE)
     if plant.delay_s > 0.0:
@@ -108,8 +111,6 @@ def sampled_plant(plant: TransferFunction, largest_gain: float = 1.0) -> Sampled
             offsets = np.geomspace(0.05 * max(abs(root.real), 1e-6 * abs(root)), abs(root.imag), 80)
             near = np.concatenate((abs(root.imag) - offsets, [abs(root.imag)], abs(root.imag) + offsets))
             omega = np.unique(np.concatenate((omega, near[(near > low) & (near < high)])))
-    # s den + num K/T_I needs its last coefficient of its first one's sign: necessary with integral action
-    sign = math.copysign(1.0, num[-1] * den[0])
     return on_grid(plant, omega, sign)
 
 

@@ -16,12 +16,14 @@ import numpy as np
 from scipy.fft import irfft
 
 from autotune.arrays import ComplexArray, FloatArray
+from autotune.design.search import MOST_SLACK, minimise
 from autotune.design.simplex import search_by_simplex
 
 _PER_CROSSOVER = 0.08  # radians of the crossover per step of time
 _LEAST, _MOST = 1 << 10, 1 << 16
 _WALL = 300.0  # cost of a constraint violated by all of it, in logarithms of the error
 _SPANS = (0.3, 0.1, 0.03)
+_NEAR = 0.05  # how far the last search may go, in logarithms of the gains
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -64,7 +66,12 @@ class LoadStep:
         spectrum = np.zeros(self.rows // 2 + 1, dtype=np.complex128)
         spectrum[1 : 2 * s.size : 2] = self.h / (1.0 + self.h * C) * wave
         y = irfft(spectrum, self.rows)
-        return float(np.mean(np.abs(y))) * self.half_period_s
+        size, following = np.abs(y), np.roll(y, -1)
+        # on a straight line from row to row: without it the sum has a ripple that searches end in
+        crossing = np.flatnonzero(y * following < 0.0)
+        a, b = size[crossing], np.abs(following[crossing])
+        too_much = np.sum(a * b / (a + b))
+        return (float(np.sum(size)) - float(too_much)) / self.rows * self.half_period_s
 
 
 def load_step(
@@ -91,32 +98,70 @@ def load_step(
     return LoadStep(omega=omega, h=response(omega), half_period_s=half, rows=rows)
 
 
-def least_error(load: LoadStep, slacks: Callable[[FloatArray], float], start: FloatArray) -> FloatArray:
+def least_error(load: LoadStep, slacks: Callable[[FloatArray], FloatArray], start: FloatArray) -> FloatArray:
     """Return the (4,) gains of least error near the start, by simplexes against a steep wall at the constraints.
+
+    The error has kinks where the response begins to swing, which no gradient leads across.
 
     Parameters
     ----------
     load : LoadStep
         What is minimised.
     slacks : callable
-        Smallest relative slack of the constraints for (4,) gains; negative is violated.
+        Relative slacks of the constraints for (4,) gains; negative is violated.
     start : (4,) array
         Gains that keep the constraints; those that are 0 stay so.
     """
+    seen = _Seen(load=load, slacks=slacks, best=start)
     free = start > 0.0
     size = int(np.sum(free))
-    best, least = start, math.log(load.error(start))
 
     def cost(p: FloatArray) -> float:
-        violated = min(slacks(p), 0.0)
-        return math.log(max(load.error(p), 1e-300)) - _WALL * violated + (10.0 if violated <= -1.0 else 0.0)
+        error, slack = seen.look(p)
+        least = float(np.min(slack))
+        return error - _WALL * min(least, 0.0) + (10.0 if least <= -1.0 else 0.0)
 
     inside = np.log([0.85, 0.75, 1.0, 1.0])[free]  # off the corner of two constraints, where a simplex would stay
     for span in _SPANS:
         for direction in (1.0, -1.0):
-            at = np.log(best[free] / start[free]) + (inside if span == _SPANS[0] else 0.0)
+            at = np.log(seen.best[free] / start[free]) + (inside if span == _SPANS[0] else 0.0)
             vertices = np.vstack((at, at + direction * span * (np.eye(size) - 0.5 / size)))
-            p = search_by_simplex(cost, start, vertices, xatol=1e-3, fatol=1e-5, maxiter=60 * size)[0]
-            if slacks(p) >= 0.0 and math.log(load.error(p)) < least:
-                best, least = p, math.log(load.error(p))
-    return best
+            search_by_simplex(cost, start, vertices, xatol=1e-3, fatol=1e-5, maxiter=60 * size)
+    return settled(load, slacks, seen.best)
+
+
+def settled(load: LoadStep, slacks: Callable[[FloatArray], FloatArray], start: FloatArray) -> FloatArray:
+    """Return the (4,) gains of least error close to a start, on their constraints to the last digits.
+
+    Parameters
+    ----------
+    load, slacks, start
+        As of :func:`least_error`; a start that misses the constraints a little is led back.
+    """
+    seen = _Seen(load=load, slacks=slacks, best=start)
+    free = start > 0.0
+
+    def look(x: FloatArray) -> tuple[float, FloatArray]:
+        p = start.copy()
+        p[free] *= np.exp(x)
+        return seen.look(p)
+
+    minimise(look, np.zeros(int(np.sum(free))), _NEAR, most=40, tolerance=1e-12)
+    return seen.best
+
+
+@dataclass(kw_only=True)
+class _Seen:
+    """The best gains that a search has looked at: where it ends may be a last digit beyond a constraint."""
+
+    load: LoadStep
+    slacks: Callable[[FloatArray], FloatArray]
+    best: FloatArray
+    least: float = math.inf
+
+    def look(self, p: FloatArray) -> tuple[float, FloatArray]:
+        """Return the logarithm of the error of gains, and their slacks."""
+        error, slack = math.log(max(self.load.error(p), 1e-300)), np.minimum(self.slacks(p), MOST_SLACK).ravel()
+        if np.min(slack) >= 0.0 and error < self.least:
+            self.best, self.least = p, error
+        return error, slack

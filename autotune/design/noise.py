@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.design.axis import characteristic_frequencies
+from autotune.design.axis import characteristic_frequencies, corner_frequencies
 from autotune.models import TransferFunction
 
 #: noise on the command [standard deviation] as a share of the command's range, from u_min to u_max
@@ -62,7 +62,7 @@ def default_noise_gain(
     ten times what the plant's gain at -135 degrees, or at the highest known frequency, lets a PI use.
     """
     if highest_rad_s is None:
-        highest_rad_s = 10.0 * float(characteristic_frequencies(plant)[-1])
+        highest_rad_s = 10.0 * float(max(corner_frequencies(plant), default=characteristic_frequencies(plant)[-1]))
     omega = np.geomspace(1e-4 * highest_rad_s, highest_rad_s, 800)
     response = plant.response(omega)
     turned = np.abs(np.unwrap(np.angle(response)) - np.angle(response[0]))

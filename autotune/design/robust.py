@@ -268,7 +268,7 @@ def _least_error(plant: UncertainPlant, specification: Specification, start: Flo
     L = n.h * K * (1.0 + 1.0 / (Ti * s) + Td * s) / (1.0 + Tf * s)
     crossover = float(n.omega[int(np.flatnonzero(np.abs(L) >= 1.0)[-1])])
     load = load_step(response, start, crossover, 1.0 / crossover)
-    found = least_error(load, lambda p: float(np.min(_slacks(plant, specification, p))) - 1e-6, start)
+    found = least_error(load, lambda p: _slacks(plant, specification, p) - 1e-6, start)
     return found if np.min(_slacks(plant, specification, found)) >= -1e-6 else start
 
 

@@ -26,10 +26,10 @@ from autotune.errors import DesignError
 from autotune.models import TransferFunction
 
 _TOLERANCE = 1e-6
-_CORRECTIONS = 6
+CORRECTIONS = 6
 _TIGHTER = (1e-4, 1e-3, 0.01, 0.03)
 _PI_GAINS = 2
-_MOST_SLACK = 10.0  # what is not asked for has infinite slack, which has no derivative
+MOST_SLACK = 10.0  # what is not asked for has infinite slack, which has no derivative
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -113,6 +113,22 @@ class Problem:
         ]
         return np.array([self.slacks_of(i, figures) for i, figures in enumerate(found)])
 
+    def corrected(self, parameters: FloatArray, offset: FloatArray) -> tuple[FloatArray, bool]:
+        """Return what the constraints on the grids must be shifted by to be the exact ones, and whether one is missed.
+
+        Parameters
+        ----------
+        parameters : (4,) array
+            K, T_I, T_d, T_f, sign taken out, times in s.
+        offset : (S, 4) array
+            What they were shifted by.
+        """
+        coarse = self.norms_and_slacks(parameters[None, :])[1][0]
+        exact = self.exact_slacks(parameters, coarse)
+        with np.errstate(invalid="ignore"):
+            step = np.where(np.isfinite(coarse), coarse - exact, 0.0)
+        return step + 0.3 * _TOLERANCE * (exact < 0.0), bool(np.min(exact) < -_TOLERANCE)
+
     def kept(self, parameters: FloatArray) -> bool:
         """Whether all plants keep the specification exactly."""
         coarse = self.norms_and_slacks(parameters[None, :])[1][0]
@@ -188,19 +204,15 @@ def _search_corrected(problem: Problem, starts: FloatArray) -> FloatArray | None
     offset = np.zeros((len(problem.plants), 4))
     best: tuple[float, FloatArray] | None = None
     candidates = starts
-    for _ in range(_CORRECTIONS):
+    for _ in range(CORRECTIONS):
         norm, parameters = _best_of(problem, candidates, offset)
         if not math.isfinite(norm):
             break
-        coarse = problem.norms_and_slacks(parameters[None, :])[1][0]
-        exact = problem.exact_slacks(parameters, coarse)
-        if float(np.min(exact)) >= -_TOLERANCE and (best is None or norm < best[0]):
+        before, (offset, missed) = offset, problem.corrected(parameters, offset)
+        if not missed and (best is None or norm < best[0]):
             best = (norm, parameters)
-        with np.errstate(invalid="ignore"):
-            step = np.where(np.isfinite(coarse), coarse - exact, 0.0)
-        if best is not None and np.max(np.abs(step - offset)) < 0.3 * _TOLERANCE:
+        if best is not None and np.max(np.abs(offset - before)) < 0.3 * _TOLERANCE:
             break
-        offset = step + 0.3 * _TOLERANCE * (exact < 0.0)
         candidates = parameters[None, :]
     return None if best is None else best[1]
 
@@ -229,7 +241,7 @@ def _local_search(problem: Problem, start: FloatArray, offset: FloatArray) -> tu
             p[free] = start[free] * np.exp(x)
             found = [evaluate(*plant, p[0], p[1], p[2], p[3], problem.omega_n) for plant in data]
             slack = np.array([problem.slacks_of(i, figures) for i, figures in enumerate(found)]) - offset
-            slack = np.minimum(slack[:, asked], _MOST_SLACK).ravel()
+            slack = np.minimum(slack[:, asked], MOST_SLACK).ravel()
             squared = float(found[0].squared_norm)
             memory[key] = (0.5 * math.log(squared), slack)
             if np.min(slack) >= -1e-9 and squared < best[0]:

@@ -15,10 +15,10 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
 from autotune.design.kernels import SampledPlant, sampled_plant
-from autotune.design.load_error import least_error, load_step
+from autotune.design.load_error import least_error, load_step, settled
 from autotune.design.loop import Plant, transfer_function_of
 from autotune.design.margins import margins
-from autotune.design.search import Problem, polish
+from autotune.design.search import CORRECTIONS, Problem, polish
 from autotune.design.search_starts import admissible, separate
 from autotune.design.specification import Design, Kind, Specification
 from autotune.errors import DesignError
@@ -26,8 +26,8 @@ from autotune.errors import DesignError
 _STARTS = 4
 #: nodes that keep nothing and are led towards what is asked for
 _LED = 4
-#: how much more than asked for is kept on the grid of frequencies, so that it is kept between them
-_TIGHTER = (1e-5, 1e-4, 1e-3, 5e-3)
+#: share of the gains by which a step moves them that is none
+_STILL = 1e-8
 #: margins between the grid's frequencies are exact to this; what is missed by more is never handed out
 _MISSED = 1e-3
 #: a proportional part that is nowhere more than this of the loop does nothing: the controller is an integral one
@@ -151,15 +151,19 @@ def _least_error(problem: Problem, controller: PIDController) -> PIDController:
     crossover = margins(H, controller).crossover_rad_s
     load = load_step(lambda omega: np.asarray(sampled.sign * H.response(omega)), start, crossover, H.delay_s)
 
-    for more in _TIGHTER:
+    def slacks(p: FloatArray) -> FloatArray:
+        return np.asarray(problem.norms_and_slacks(p[None, :])[1][0] - offset)
 
-        def slacks(p: FloatArray, more: float = more) -> float:
-            return float(np.min(problem.norms_and_slacks(p[None, :])[1])) - more
-
-        found = least_error(load, slacks, start)
-        if problem.kept(found):
-            return problem.controller(found)
-    return controller
+    offset, best = np.zeros((len(problem.plants), 4)), start
+    p = least_error(load, slacks, start)
+    for _ in range(CORRECTIONS):
+        offset, missed = problem.corrected(p, offset)
+        if not missed and load.error(p) < load.error(best):
+            best = p
+        before, p = p, settled(load, slacks, p)
+        if np.allclose(p, before, rtol=_STILL, atol=0.0):
+            break
+    return problem.controller(best)
 
 
 def weight_set_point(controller: PIDController, specification: Specification) -> PIDController:

@@ -1,0 +1,59 @@
+"""A controller is the same loop whatever the units and signs of command and reading are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import lfilter
+
+import autotune as at
+from autotune.controller import PIDController
+from autotune.design.kernels import sampled_plant
+from autotune.design.noise import LoopFacts, default_noise_gain
+from autotune.models import TransferFunction
+from autotune.recording import Recording
+
+T = 0.5 * np.arange(1200)
+
+
+def levels() -> tuple[np.ndarray, np.ndarray]:
+    """Return a command of random levels, and what two lags and a dead time make of it."""
+    rng = np.random.default_rng(3)
+    u = 5.0 + 0.7 * np.repeat(rng.choice([-1.0, 1.0], 60), 20)
+    x = lfilter([0.05], [1.0, -0.95], np.concatenate([np.zeros(5), u[:-5] - 5.0]))
+    return u, 20.0 + 3.0 * lfilter([0.1], [1.0, -0.9], x) + 0.02 * rng.standard_normal(T.size)
+
+
+def step() -> tuple[np.ndarray, np.ndarray]:
+    """Return one step, and what a lag and a dead time make of it."""
+    u = np.where(T < 50.0, 5.0, 6.0)
+    x = lfilter([0.02], [1.0, -0.98], np.concatenate([np.zeros(8), u[:-8] - 5.0]))
+    return u, 20.0 + 3.0 * x + 0.02 * np.random.default_rng(4).standard_normal(T.size)
+
+
+def tuned(u: np.ndarray, y: np.ndarray) -> PIDController:
+    found = at.tune(Recording(t=T, u=u, y=y, name="test")).controller
+    assert isinstance(found, PIDController)
+    return found
+
+
+@pytest.mark.parametrize("recorded", [levels, step])
+@pytest.mark.parametrize(("of_u", "of_y"), [(1.0, -2.5), (-4.0, 1e-4)])
+def test_a_recording_in_other_units_gives_the_same_loop(recorded, of_u: float, of_y: float) -> None:
+    u, y = recorded()
+    here, there = tuned(u, y), tuned(of_u * u, of_y * y)
+    # along a constraint the error is flat: gains are known to a few parts in 1e5
+    assert there.K * of_y / of_u == pytest.approx(here.K, rel=2e-4)
+    assert there.Ti_s == pytest.approx(here.Ti_s, rel=2e-4)
+
+
+@given(gain=st.floats(1e-6, 1e6), sign=st.sampled_from((-1.0, 1.0)), lag=st.floats(0.01, 1e3))
+@settings(max_examples=50)
+def test_a_plants_frequencies_and_its_noise_gain_follow_its_units(gain: float, sign: float, lag: float) -> None:
+    one = TransferFunction(num=(2.0,), den=(lag, 1.0))
+    other = TransferFunction(num=(2.0 * sign * gain,), den=(lag, 1.0))
+    np.testing.assert_allclose(sampled_plant(other, 50.0 / gain).omega, sampled_plant(one, 50.0).omega, rtol=1e-9)
+    most = default_noise_gain(one, LoopFacts())[0]
+    assert default_noise_gain(other, LoopFacts())[0] * gain == pytest.approx(most, rel=1e-9)
