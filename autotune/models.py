@@ -98,6 +98,11 @@ class TransferFunction:
         return np.asarray(np.roots(self.num), dtype=np.complex128)
 
     @property
+    def settling_den(self) -> tuple[float, ...]:
+        """Denominator without its integrators: without the coefficients after the last one that is not 0."""
+        return self.den[: max(j for j, c in enumerate(self.den) if c != 0.0) + 1]
+
+    @property
     def integrators(self) -> int:
         """Number of poles at s = 0 that the numerator does not cancel."""
 

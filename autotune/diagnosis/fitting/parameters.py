@@ -189,15 +189,16 @@ def chain_parameters(
     Returns
     -------
     free, centre
-        Gain, every lag (coefficients of denominators above the constant), zeros, dead time where the model has one,
-        and the command's operating point.
+        Gain, every lag (coefficients of denominators above the last one that is not 0), zeros, dead time where the
+        model has one, and the command's operating point.
     """
     free = [Free(name="gain", kind="gain", spread=prior_spread)]
     centre = [0.0]
     for i, block in enumerate(blocks):
         den, num = block.dynamics.den, block.dynamics.num
-        for j in range(len(den) - 1):
-            if den[j] != 0.0 and den[-1] != 0.0:
+        # the last coefficient goes with the gain: of what integrates, the last one that is not 0
+        for j in range(len(block.dynamics.settling_den) - 1):
+            if den[j] != 0.0:
                 spread = prior_spread * (DAMPING if _is_damping(den, j) else 1.0)
                 free.append(Free(name=f"{block.name} den[{j}]", kind="den", index=(i, j), spread=spread))
                 centre.append(0.0)

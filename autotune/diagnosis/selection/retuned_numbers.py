@@ -75,13 +75,13 @@ def _called(model: Model, free: Free) -> tuple[str, str, str]:
     power = _power(block, free)
     unit = "s" if power == 1 else f"s^{power}"
     if free.kind == "den":
-        name = "time constant" if len(block.dynamics.den) == 2 else f"coefficient of s^{power} below"
+        name = "time constant" if len(block.dynamics.settling_den) == 2 else f"coefficient of s^{power} below"
         return block.name, name.replace("s^1 ", "s "), unit
     return block.name, "time constant of the zero" if power == 1 else f"zeros, s^{power}", unit
 
 
 def _power(block: Block, free: Free) -> int:
-    polynomial = block.dynamics.den if free.kind == "den" else block.dynamics.num
+    polynomial = block.dynamics.settling_den if free.kind == "den" else block.dynamics.num
     return len(polynomial) - 1 - free.index[1]
 
 
@@ -105,10 +105,9 @@ def _value(model: Model, free: Free) -> float:
     if free.kind == "delay":
         return sum(block.dynamics.delay_s for block in model.blocks)
     block = model.blocks[gain_block(model.blocks) if free.kind == "gain" else free.index[0]]
-    num, den = block.dynamics.num, block.dynamics.den
+    num, den = block.dynamics.num, block.dynamics.settling_den
     if free.kind == "gain":
-        below = next(c for c in reversed(den) if c != 0.0)
-        return next((c for c in reversed(num) if c != 0.0), 0.0) / below
+        return next((c for c in reversed(num) if c != 0.0), 0.0) / den[-1]
     if free.kind == "den":
         return den[free.index[1]] / den[-1]
     return num[free.index[1]] / num[-1] if num[-1] != 0.0 else num[free.index[1]]

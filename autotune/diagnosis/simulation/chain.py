@@ -168,7 +168,7 @@ def chain_of(blocks: tuple[Block, ...], name: str) -> Chain:
     if not 1 <= order <= 12:
         raise InputError(f"the chain has {order} states", where=name, remedy="diagnosis handles 1 to 12 states")
     plant, law = _plant_blocks(blocks), _law(blocks)
-    blocks = blocks if law is not None else _in_readings(blocks, plant[-1])
+    blocks = blocks if law is not None else _in_readings(blocks, plant)
     A, B = np.zeros((order, order)), np.zeros((order, kernel.INPUTS))
     signals, edges = _arranged(blocks, plant, law, A, B)
     taps = signals.taps
@@ -246,22 +246,28 @@ def _plant_blocks(blocks: Sequence[Block]) -> list[int]:
     return plant or [max(dynamic, key=slowness)]
 
 
-def _in_readings(blocks: tuple[Block, ...], last: int) -> tuple[Block, ...]:
-    """Return blocks with the static gain of those behind the plant put into the plant's last one.
+def _in_readings(blocks: tuple[Block, ...], plant: Sequence[int]) -> tuple[Block, ...]:
+    """Return blocks whose gains behind a plant's states are in front of them; the chain from end to end is the same.
 
-    From command to reading the chain is the same; position and level are in the reading's unit, as effects are.
+    The last state, a position or level, is in the reading's unit then, and a speed is what the position changes by.
     """
-    behind = [block.dynamics for block in blocks[last + 1 :]]
-    gain = math.prod(d.num[-1] / d.den[-1] if d.den[-1] != 0.0 else 0.0 for d in behind)
-    if gain in (0.0, 1.0):
+    first, last = plant[0], plant[-1]
+    behind = math.prod(_gain(block) for block in blocks[last + 1 :])
+    speed = first != last and _integrates(blocks[last])
+    within = math.prod(_gain(block) for block in blocks[first + 1 : last + 1]) if speed else 1.0
+    if behind * within == 0.0:
         return blocks
-    return (*blocks[:last], _amplified(blocks[last], gain), _amplified(blocks[last + 1], 1.0 / gain),
-            *blocks[last + 2 :])  # fmt: skip
+    moved = list(blocks)
+    for at, gain in ((first if speed else last, behind * within), (last, 1.0 / within), (last + 1, 1.0 / behind)):
+        if gain != 1.0:
+            dynamics = moved[at].dynamics
+            moved[at] = replace(moved[at], dynamics=replace(dynamics, num=tuple(gain * c for c in dynamics.num)))
+    return tuple(moved)
 
 
-def _amplified(block: Block, gain: float) -> Block:
-    """Return a block with another gain."""
-    return replace(block, dynamics=replace(block.dynamics, num=tuple(gain * c for c in block.dynamics.num)))
+def _gain(block: Block) -> float:
+    """Return the gain of a block at rest, of an integrator that of its rate."""
+    return block.dynamics.num[-1] / block.dynamics.settling_den[-1]
 
 
 def _law(blocks: Sequence[Block]) -> int | None:
@@ -293,8 +299,7 @@ def _note_signals(
     (first, last), (taps, gains, where) = ends, (signals.taps, signals.gains, signals.where)
     den, n = block.dynamics.den, c.size
     # of what integrates, the gain to what it integrates: to the speed, written as one block or as two
-    static = block.dynamics.num[-1] / next(c for c in reversed(den) if c != 0.0)
-    static = static or 1.0  # a plant without static gain, as a derivative: forces count as they come out
+    static = _gain(block) or 1.0  # a plant without static gain, as a derivative: forces count as they come out
     if first:
         gains[0] = static
         taps[kernel.FIRST_LEVEL] = row
