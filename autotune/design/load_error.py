@@ -127,10 +127,10 @@ def least_error(load: LoadStep, slacks: Callable[[FloatArray], FloatArray], star
             at = np.log(seen.best[free] / start[free]) + (inside if span == _SPANS[0] else 0.0)
             vertices = np.vstack((at, at + direction * span * (np.eye(size) - 0.5 / size)))
             search_by_simplex(cost, start, vertices, xatol=1e-3, fatol=1e-5, maxiter=60 * size)
-    return settled(load, slacks, seen.best)
+    return settle(load, slacks, seen.best)
 
 
-def settled(load: LoadStep, slacks: Callable[[FloatArray], FloatArray], start: FloatArray) -> FloatArray:
+def settle(load: LoadStep, slacks: Callable[[FloatArray], FloatArray], start: FloatArray) -> FloatArray:
     """Return the (4,) gains of least error close to a start, on their constraints to the last digits.
 
     Parameters

@@ -15,7 +15,7 @@ import numpy as np
 from autotune.arrays import FloatArray
 from autotune.controller import PIDController
 from autotune.design.kernels import SampledPlant, sampled_plant
-from autotune.design.load_error import least_error, load_step, settled
+from autotune.design.load_error import least_error, load_step, settle
 from autotune.design.loop import Plant, transfer_function_of
 from autotune.design.margins import margins
 from autotune.design.search import CORRECTIONS, Problem, polish
@@ -160,7 +160,7 @@ def _least_error(problem: Problem, controller: PIDController) -> PIDController:
         offset, missed = problem.corrected(p, offset)
         if not missed and load.error(p) < load.error(best):
             best = p
-        before, p = p, settled(load, slacks, p)
+        before, p = p, settle(load, slacks, p)
         if np.allclose(p, before, rtol=_STILL, atol=0.0):
             break
     return problem.controller(best)
