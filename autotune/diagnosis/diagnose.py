@@ -118,10 +118,12 @@ def _diagnosis(
     own = {name: p * share_of(name, evidence.candidates) for name, p in said.items()}
     others = {name: p for name, p in own.items() if name not in {e.name for e in named}}
     ruled_out = 1.0 - evidence.limits.decided
-    effects = tuple(
+    stated = (
         replace(e, probability=own[e.name], alike=alike(e.name, others, ruled_out), together=said[e.name])
         for e in named
     )
+    # the surest first by what all sets of rows say; about as sure ones stay by how much they explain
+    effects = tuple(sorted(stated, key=lambda e: -round(e.probability, 1)))
     description = evidence.description() if verdict == "unexplained" and not instead else None
     places = () if instead else places_of(evidence, effects, description)
     handed_out, wanted = evidence.handed_out("none" if instead else verdict)

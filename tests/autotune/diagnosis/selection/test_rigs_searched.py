@@ -173,7 +173,7 @@ def test_what_stands_for_something_else_once_it_is_fitted_to_the_end_is_not_judg
     model = Model(name="oven", input=Port(unit="%"), output=port, blocks=(heater,))
     recording = Recording(t=t, u=np.full(t.size, 50.0), y=y)
     data, start = prepare(model, [recording], good(recording), IN_USE)
-    values = {"frequency": Parameter(value=0.0044), "damping": Parameter(value=0.9)}
+    values = {"frequency": Parameter(value=0.0044), "damping": Parameter(value=1.1)}
     p, theta, states = extend(start, Effect(name="plant.resonance", parameters=values), data)
     known = fit(p, data, theta, states)
     assert known.model.effects[0].parameters["damping"].value > 1.0
@@ -218,12 +218,17 @@ def test_a_sign_that_is_missing_is_no_noise():
 
 
 def carriage(level: float, cogging: float) -> Recording:
-    """tau dv/dt = -v + .159 (3.3 u - level sign(v) - cogging sin(27 x)), sticking at rest; u turns at two places."""
+    """tau dv/dt = -v + .159 (3.3 u - level sign(v) - cogging sin(27 x)), sticking at rest; u turns at two places.
+
+    Each time it is another one of two commands: under one alone, friction is a smaller gain and another lag.
+    """
     rng, rows, dt, h = np.random.default_rng(2), 2000, 0.007, 0.007 / 8
     u, y, (x, v), sign = np.empty(rows), np.empty(rows), (0.4, 0.0), 1.0
+    size = 4.0
     for k in range(rows):
-        sign = -1.0 if x > 0.55 else 1.0 if x < 0.4 else sign
-        u[k], y[k] = 4.0 * sign, x
+        turned = -1.0 if x > 0.55 else 1.0 if x < 0.4 else sign
+        size, sign = size if turned == sign else 5.5 - size, turned
+        u[k], y[k] = size * sign, x
         for _ in range(8):
             drive = 3.3 * u[k] - cogging * math.sin(27.0 * x) - v / 0.159
             held = v == 0.0 and abs(drive) <= level
