@@ -185,6 +185,12 @@ class Block:
         return self.unit.strip().lower() in TEMPERATURE_UNITS or bool(HEATED.search(said) or FILLED.search(said))
 
 
+def law_of(blocks: Sequence[Block]) -> int | None:
+    """Return the number of the plant's block where the plant is a law without dynamics."""
+    plant = [i for i, b in enumerate(blocks) if b.place == "plant"]
+    return plant[0] if plant and all(len(blocks[i].dynamics.den) == 1 for i in plant) else None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Parameter:
     """A value with its standard deviation and unit; the standard deviation is NaN where it is not known."""
@@ -265,9 +271,7 @@ class Model:
     @property
     def force_unit(self) -> str:
         """Unit of the plant's forces: of its input, or of the reading where the plant is a law without dynamics."""
-        plant = [b for b in self.blocks if b.place == "plant"]
-        is_law = plant != [] and all(len(b.dynamics.den) == 1 for b in plant)
-        return self.output.unit if is_law else self.plant_input_unit
+        return self.plant_input_unit if law_of(self.blocks) is None else self.output.unit
 
     @property
     def speed_unit(self) -> str:

@@ -17,7 +17,7 @@ import numpy as np
 from autotune.arrays import FloatArray, IntArray
 from autotune.diagnosis.simulation import kernel
 from autotune.errors import InputError
-from autotune.models import Block, Model, TransferFunction
+from autotune.models import Block, Model, TransferFunction, law_of
 
 #: Positions in a chain's ``where``.
 ACTUATOR, SPEED, POSITION = range(3)
@@ -119,7 +119,7 @@ def _realise(block: Block) -> tuple[FloatArray, FloatArray, FloatArray, float]:
         # a stop holds a state where readings say: the first state is the output, and not this over the gain
         b[-1] = c[0] if c[0] != 0.0 else 1.0
         c = c / b[-1]
-    return A, b, c.copy(), direct
+    return A, b, c, direct
 
 
 def _realise_first_order(dynamics: TransferFunction) -> tuple[FloatArray, FloatArray, FloatArray, float]:
@@ -167,7 +167,7 @@ def chain_of(blocks: tuple[Block, ...], name: str) -> Chain:
     order = sum(len(block.dynamics.den) - 1 for block in blocks)
     if not 1 <= order <= 12:
         raise InputError(f"the chain has {order} states", where=name, remedy="diagnosis handles 1 to 12 states")
-    plant, law = _plant_blocks(blocks), _law(blocks)
+    plant, law = _plant_blocks(blocks), law_of(blocks)
     blocks = blocks if law is not None else _in_readings(blocks, plant)
     A, B = np.zeros((order, order)), np.zeros((order, kernel.INPUTS))
     signals, edges = _arranged(blocks, plant, law, A, B)
@@ -208,7 +208,7 @@ def _arranged(
         if block.place == "actuator" and rests != 0.0 and number < plant[0] and signals.where[ACTUATOR] < 0:
             # which way a lag goes is told by the command beside its state: both in the command's unit
             b, c, signals.where[ACTUATOR] = b / rests, c * rests, at
-        commanded *= block.dynamics.num[-1] / block.dynamics.den[-1] if block.dynamics.den[-1] != 0.0 else 0.0
+        commanded *= _gain(block) if block.dynamics.den[-1] != 0.0 else 0.0
         if number == plant[0]:
             taps[kernel.PLANT_IN], gains[2] = row, direct[0]
             direct[1] = 1.0
@@ -268,12 +268,6 @@ def _in_readings(blocks: tuple[Block, ...], plant: Sequence[int]) -> tuple[Block
 def _gain(block: Block) -> float:
     """Return the gain of a block at rest, of an integrator that of its rate."""
     return block.dynamics.num[-1] / block.dynamics.settling_den[-1]
-
-
-def _law(blocks: Sequence[Block]) -> int | None:
-    """Return the number of the plant's block where the plant is a law without dynamics."""
-    plant = [i for i, b in enumerate(blocks) if b.place == "plant"]
-    return plant[0] if plant and all(len(blocks[i].dynamics.den) == 1 for i in plant) else None
 
 
 def _integrates(block: Block) -> bool:
