@@ -37,10 +37,6 @@ _THIN = 4
 _STARTS, _APART = 2, 0.25
 #: where no node is kept: so many are looked at, and the best of them led towards what is asked for, a little inside
 _LOOKED, _LED, _INSIDE = 300, 3, 0.002
-#: a search begins anew from where it came to, so often at most, until the norm (log) changes by less
-_RESTARTS, _SETTLED = 6, 1e-4
-#: slope of the wall that a simplex meets at a constraint, norm (log) per relative slack
-_WALL = 1e4
 
 
 def design_on_points(points: Sequence[FrequencyPoint], specification: Specification, kind: Kind = "pi") -> Design:
@@ -149,17 +145,8 @@ def _search_structure(plant: UncertainPlant, specification: Specification, kind:
     starts = _first_kept(coarse, specification, grid[order]) or _raise_least_slack(coarse, specification, grid[order])
     if not starts:
         raise _unreachable(plant, specification, kind, grid)
-    # a simplex is not caught by the kinks of the least slack, which the quadratic programme sometimes is; in four
-    # dimensions it is the simplex that stops short
-    near = [_simplex(coarse, specification, starts[0], 0.3)] if kind == "pi" else starts
-    found = [_quadratic(coarse, specification, start, (1.0, 0.1)) for start in near]
-    best = min(found, key=lambda p: _norm(coarse, p))
-    for _ in range(_RESTARTS if kind == "pi" else 1):  # a kink may hold a simplex, but hardly a new one around it
-        before = _norm(plant, best)
-        near_best = _simplex(plant, specification, best, 0.1) if kind == "pi" else best
-        best = _quadratic(plant, specification, near_best, (0.1,), best)
-        if abs(before - _norm(plant, best)) < _SETTLED:
-            break
+    found = [_quadratic(coarse, specification, start, (1.0, 0.1)) for start in starts]
+    best = _quadratic(plant, specification, min(found, key=lambda p: _norm(coarse, p)), (0.1, 0.1))
     if np.min(_slacks(plant, specification, best)) < -1e-6:  # feasible between the coarse frequencies only
         best = _quadratic(plant, specification, _inwards(plant, specification, starts[0]), (1.0, 0.1))
     if np.min(_slacks(plant, specification, best)) < -1e-6:
@@ -208,34 +195,16 @@ def _inwards(plant: UncertainPlant, specification: Specification, p: FloatArray)
     return p
 
 
-def _simplex(plant: UncertainPlant, specification: Specification, start: FloatArray, span: float) -> FloatArray:
-    """Return the controller that a simplex of size ``span`` with a steep wall at the constraints comes to."""
-
-    def cost(p: FloatArray) -> float:
-        violated = np.minimum(_slacks(plant, specification, p), 0.0)
-        return _norm(plant, p) - _WALL * float(np.min(violated))
-
-    size = int(np.sum(start > 0.0))
-    vertices = np.vstack((np.zeros(size), span * (np.eye(size) - 0.5 / size)))
-    return search_by_simplex(cost, start, vertices, xatol=1e-4, fatol=1e-6, maxiter=200 * size)[0]
-
-
 def _quadratic(
     plant: UncertainPlant,
     specification: Specification,
     start: FloatArray,
     spans: Sequence[float],
-    otherwise: FloatArray | None = None,
 ) -> FloatArray:
-    """Return the best controller that sequential quadratic programming in log gains looked at.
-
-    ``otherwise``, or ``start`` where it is absent, stands where it is better, or where none keeps the constraints.
-    """
+    """Return the best controller that sequential quadratic programming in log gains looked at, or else ``start``."""
     free = start > 0.0
     memory: dict[bytes, tuple[float, FloatArray]] = {}
     best: tuple[float, FloatArray] = (math.inf, start)
-    if otherwise is not None and np.min(_slacks(plant, specification, otherwise)) >= 0.0:
-        best = (_norm(plant, otherwise), otherwise)
 
     def look(x: FloatArray) -> tuple[float, FloatArray]:
         nonlocal best

@@ -107,18 +107,47 @@ def _nominal(processes: ConsistentProcesses) -> SampledPlant:
 
 
 @njit(cache=True, error_model="numpy")
-def _lowest_phase_at_unit_gain(a: FloatArray, b: FloatArray, h: FloatArray, h_next: FloatArray) -> float:
-    """Return the lowest phase at log gain 0 in the hull of two sets given by their supports; 1e300 if none is there."""
-    lowest, highest = -1e300, 1e300
-    for d in range(len(a)):
-        H = max(h[d], h_next[d])
-        if b[d] < -1e-9:
-            lowest = max(lowest, H / b[d])
-        elif b[d] > 1e-9:
-            highest = min(highest, H / b[d])
-        elif H < 0.0:
-            return 1e300
-    return lowest if lowest <= highest else 1e300
+def _margins_at_unit_gain(
+    b: FloatArray, h: FloatArray, h_next: FloatArray, w: float, w_next: float
+) -> tuple[float, float]:
+    """Return the least phase and delay margins at log gain 0 between two frequencies; 1e300 where none is there.
+
+    On that way the supports are h + s (h_next - h), s from 0 to 1. The hull of both sets holds it too, but makes steps
+    as wide as the grid while the gain grows, in whose corners a search ends.
+    """
+    first, last = 0.0, 1.0
+    n = len(b)
+    for d in range(n):  # b_d p <= h_d(s) leaves a phase p where each bound from below is below each from above
+        for e in range(n):
+            if b[d] < -1e-9 and b[e] > 1e-9:
+                at_0, at_1 = h[d] * b[e] - h[e] * b[d], h_next[d] * b[e] - h_next[e] * b[d]
+            elif d == e and abs(b[d]) <= 1e-9:
+                at_0, at_1 = h[d], h_next[d]
+            else:
+                continue
+            if at_0 < 0.0 and at_1 < 0.0:
+                return 1e300, 1e300
+            if at_0 < 0.0:
+                first = max(first, at_0 / (at_0 - at_1))
+            elif at_1 < 0.0:
+                last = min(last, at_0 / (at_0 - at_1))
+    phase = delay = 1e300
+    if first > last:
+        return phase, delay
+    for d in range(n):  # the bound from below is convex in s: least at an end, or where two of its lines meet
+        for e in range(d, n):
+            if b[d] >= -1e-9 or b[e] >= -1e-9:
+                continue
+            level, slope = h[d] / b[d] - h[e] / b[e], (h_next[d] - h[d]) / b[d] - (h_next[e] - h[e]) / b[e]
+            meets = -level / slope if slope != 0.0 else first
+            for s in (first, last, min(max(meets, first), last)):
+                lowest = -1e300
+                for k in range(n):
+                    if b[k] < -1e-9:
+                        lowest = max(lowest, (h[k] + s * (h_next[k] - h[k])) / b[k])
+                phase = min(phase, lowest + math.pi)
+                delay = min(delay, (lowest + math.pi) / (w + s * (w_next - w)))
+    return phase, delay
 
 
 @njit(cache=True, error_model="numpy")
@@ -182,9 +211,9 @@ def guaranteed_figures(
             h[d] = supports[i, d] + a[d] * gain_C + b[d] * phase_C
         near_unit = max(h[0], h_before[0]) >= 0.0 and max(h[directions // 2], h_before[directions // 2]) >= 0.0
         if i > 0 and near_unit:
-            angle = _lowest_phase_at_unit_gain(a, b, h_before, h) + math.pi
+            angle, least_s = _margins_at_unit_gain(b, h_before, h, omega[i - 1], w)
             if angle < 1e299:
-                phase, delay, crossed = min(phase, angle), min(delay, angle / w), True
+                phase, delay, crossed = min(phase, angle), min(delay, least_s), True
         # what is surely above 1, as below the crossover of an integrating plant, no larger gain brings to -1
         if -h[3 * directions // 4] <= -math.pi and h[directions // 2] > 0.0:
             growth = max(growth, h[0])

@@ -27,8 +27,8 @@ FIRST_SMOOTHING = 5
 RAMP_SAMPLES, RAMP_SAMPLE_S = 600.0, 0.01
 #: part of limits.swing that y moves by, beside the noise, before the plant counts as moving
 MOVED_SHARE = 0.15
-#: time that the plant gets to move at the end of the ramp [s of ramp]
-MARGIN_S = 2.0
+#: part of the time in which a ramp goes through one u_uncertainty that the plant gets to move at its end
+MARGIN_SHARE = 1.0 / 3.0
 #: parts of limits.time_s to wait for a first switch in all, and before the mid-point is moved
 PATIENCE_SHARE, NUDGE_SHARE = 0.25, 0.02
 #: part of the way to the operating point that the relay's centre begins ahead of the plant
@@ -53,69 +53,78 @@ def approach(
         The plant does not answer, answers before it should, or with the sign it should not have.
     """
     if point.approach == "ramp":
-        reach = BRACKET * point.u_uncertainty
-        bracket = (point.u_guess - reach, point.u_guess + reach)
-        if u_rest is not None:
-            bracket = (max(bracket[0], u_rest - 0.25 * reach), bracket[1])
-        return _ramp(loop, point, known, tell, bracket)
+        return _ramp(loop, point, known, tell, u_rest)
     known = replace(known, midpoint=u_rest if u_rest is not None else known.u_held, y_moved=point.y)
     known = replace(known, first_move_s=loop.tick.t_s)
     return known if known.plant_sign != 0 else find_sign(loop, point, known, tell)
 
 
-def _ramp(
-    loop: ControlLoop, point: OperatingPointSettings, known: Known, tell: Tell, bracket: tuple[float, float]
-) -> Known:
-    """Ramp the command through the bracket until y leaves its rest."""
+def _ramp(loop: ControlLoop, point: OperatingPointSettings, known: Known, tell: Tell, u_rest: float | None) -> Known:
+    """Ramp the command from its own side through where u_guess and its uncertainty allow, until y leaves its rest."""
     limits = loop.envelope.settings
     usual = point.u_uncertainty / (RAMP_SAMPLES * max(loop.sample_time_s, RAMP_SAMPLE_S))
     rate = point.ramp_rate if point.ramp_rate is not None else usual
-    low, high = max(bracket[0], limits.u_min), min(bracket[1], limits.u_max)
-    while abs(loop.tick.u - low) > rate * loop.sample_time_s + loop.envelope.u_step:
-        loop.step(loop.nearest(low))
-    tell(f"ramping the command from {low:.3g} to {high:.3g} until the plant moves")
+    begin, end = _way_of_ramp(loop, point, u_rest)
+    slope = math.copysign(rate, end - begin)
+    while abs(loop.tick.u - begin) > rate * loop.sample_time_s + loop.envelope.u_step:
+        loop.step(loop.nearest(begin))
+    tell(f"ramping the command from {begin:.3g} to {end:.3g} until the plant moves")
     distance = 2.0 * known.noise_half + MOVED_SHARE * limits.swing
     start_s = half_s = loop.tick.t_s
     moved = 0.0
     while abs(moved) < distance:
-        u = low + rate * (loop.tick.t_s - start_s)
-        if u > high + MARGIN_S * rate:
+        travel = rate * (loop.tick.t_s - start_s)
+        if travel > abs(end - begin) + MARGIN_SHARE * point.u_uncertainty:
             raise ExperimentStopped(
-                f"the plant does not answer: y stays at {known.y_rest:.4g} up to the command {high:.4g}",
+                f"the plant does not answer: y stays at {known.y_rest:.4g} up to the command {end:.4g}",
                 where="approach",
                 remedy="look for a stuck or saturated actuator; else correct operating_point.u_guess or u_uncertainty",
             )
-        tick = loop.step(loop.nearest(min(u, high)))
+        tick = loop.step(loop.nearest(begin + math.copysign(min(travel, abs(end - begin)), slope)))
         moved = median(loop.monitor.recent) - known.y_rest
         half_s = tick.t_s if abs(moved) < 0.5 * distance else half_s
     # y leaves like time to the power 2 to 3: it has gone half of the way after 0.76 of the time
     since = min((loop.tick.t_s - half_s) / 0.24, loop.tick.t_s - start_s)
-    sign = _sign_of(moved, rate * (loop.tick.t_s - start_s), loop, known)
+    sign = _sign_of(moved, slope * (loop.tick.t_s - start_s), loop, known)
     return replace(
         known,
         plant_sign=sign,
         sign_seen=True,
         midpoint_seen=True,
-        midpoint=loop.tick.u - rate * since,
+        midpoint=loop.tick.u - slope * since,
         first_move_s=loop.tick.t_s - since,
         y_moved=known.y_rest + moved,
         speed=2.5 * distance / since,
     )
 
 
+def _way_of_ramp(loop: ControlLoop, point: OperatingPointSettings, u_rest: float | None) -> tuple[float, float]:
+    """Return the commands between which to ramp [u unit], first the one on the side of what the rig holds.
+
+    On its way to the other one the command would cross the operating point at its full rate.
+    """
+    limits, reach = loop.envelope.settings, BRACKET * point.u_uncertainty
+    side = 1.0 if loop.tick.u > point.u_guess else -1.0
+    before = reach if u_rest is None else min(reach, side * (u_rest - point.u_guess) + 0.25 * reach)
+    begin, end = point.u_guess + side * before, point.u_guess - side * reach
+    return min(max(begin, limits.u_min), limits.u_max), min(max(end, limits.u_min), limits.u_max)
+
+
 def _sign_of(moved: float, climbed: float, loop: ControlLoop, known: Known) -> int:
-    """Return the sign of the plant's gain from how y moved while the command climbed by ``climbed``."""
-    sign = 1 if moved > 0 else -1
-    if climbed <= 2.0 * loop.envelope.u_step:
+    """Return the sign of the plant's gain from how y moved while the command climbed by ``climbed``, or fell."""
+    sign = 1 if moved * climbed > 0 else -1
+    if abs(climbed) <= 2.0 * loop.envelope.u_step:
         raise ExperimentStopped(
             f"wrong sign, or the plant moves where it should rest: y went from {known.y_rest:.4g} to"
             f" {known.y_rest + moved:.4g} at the command {loop.tick.u:.4g}",
             where="approach",
-            remedy="check the wiring and scaling of the actuator; else lower operating_point.u_guess",
+            remedy=f"check the wiring and scaling of the actuator; else {'lower' if climbed >= 0 else 'raise'}"
+            " operating_point.u_guess",
         )
     if known.plant_sign not in (0, sign):
         raise ExperimentStopped(
-            f"wrong sign: y moved by {moved:.3g} when the command rose, plant_sign is {known.plant_sign}",
+            f"wrong sign: y moved by {moved:.3g} when the command {'rose' if climbed > 0 else 'fell'}, plant_sign is"
+            f" {known.plant_sign}",
             where="approach",
             remedy="correct plant_sign, or check the wiring of actuator and sensor",
         )

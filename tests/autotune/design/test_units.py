@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -12,8 +14,11 @@ import autotune as at
 from autotune.controller import PIDController
 from autotune.design.kernels import sampled_plant
 from autotune.design.noise import LoopFacts, default_noise_gain
+from autotune.design.robust import design_on_points
+from autotune.design.specification import spec1
 from autotune.models import TransferFunction
 from autotune.recording import Recording
+from tests.autotune.design.plants import BALL, measured
 
 T = 0.5 * np.arange(1200)
 
@@ -57,3 +62,17 @@ def test_a_plants_frequencies_and_its_noise_gain_follow_its_units(gain: float, s
     np.testing.assert_allclose(sampled_plant(other, 50.0 / gain).omega, sampled_plant(one, 50.0).omega, rtol=1e-9)
     most = default_noise_gain(one, LoopFacts())[0]
     assert default_noise_gain(other, LoopFacts())[0] * gain == pytest.approx(most, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_design_on_points_does_not_hang_on_their_last_digit(seed: int) -> None:
+    """A guarantee that makes steps as the gain grows has corners in which a search ends, elsewhere for each digit."""
+
+    def gains(factor: float) -> tuple[float, float]:
+        points = [replace(p, response=p.response * factor) for p in measured(BALL, seed)]
+        found = design_on_points(points, spec1(0.5)).controller
+        return found.K * factor, found.Ti_s
+
+    here = gains(1.0)
+    for factor in (1.0 + 1e-12, 1.0 - 3e-12, 1.0 + 2e-11):
+        assert gains(factor) == pytest.approx(here, rel=2e-5)
