@@ -53,7 +53,7 @@ class FoundEffect:
     parameters : mapping of str to Parameter
         Its numbers with units.
     windows : tuple of (recording, t0, t1)
-        When it acts.
+        When it acts, recordings counted from 0 in the order given.
     operating_range : OperatingRange, optional
         Between which values of its signal it was seen.
     state, port, input, column : str
@@ -194,6 +194,8 @@ class Diagnosis:
         What would decide between what is left.
     withheld : str
         Why the extended model is without what was found, where it is.
+    order : tuple of int
+        Number, in the order in which they were given, of each recording of ``search``.
     """
 
     verdict: Verdict
@@ -209,6 +211,7 @@ class Diagnosis:
     description: Description | None = None
     next_experiment: NextExperiment | None = None
     withheld: str = ""
+    order: tuple[int, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Return the content of diagnosis.json."""

@@ -260,13 +260,14 @@ def _when(known: _Evidence) -> Section:
 
 
 def _is_at_times(effect: FoundEffect, known: _Evidence) -> bool:
-    recordings = known.found.search.recordings
-    ends = {(i, float(r.t[0]), float(r.t[-1])) for i, r in enumerate(recordings)}
+    recordings = zip(known.found.order, known.found.search.recordings, strict=True)
+    ends = {(i, float(r.t[0]), float(r.t[-1])) for i, r in recordings}
     return set(effect.windows) != ends
 
 
 def _times(effect: FoundEffect, known: _Evidence, most: int = 6) -> str:
-    said = [f"{a:.4g} to {b:.4g} s of {known.names[i]}" for i, a, b in effect.windows[:most]]
+    names = dict(zip(known.found.order, known.names, strict=True))
+    said = [f"{a:.4g} to {b:.4g} s of {names[i]}" for i, a, b in effect.windows[:most]]
     more = len(effect.windows) - len(said)
     return ", ".join(said) + (f" and {more} more" if more > 0 else "")
 

@@ -45,15 +45,15 @@ def cuttings_in(
     Where windows are many a stretch is some of them. Else the rows are cut twice: into stretches of as many rows each,
     and into those that tell as much each, see :func:`weights_of_rows`.
     """
-    windows, judged = sum(len(a) for a in firsts), _beyond_heads([y.size for y in readings], firsts, ends)
-    if windows < STRETCHES:
+    judged = _beyond_heads([y.size for y in readings], firsts, ends)
+    if sum(len(a) for a in firsts) < STRETCHES:
         return [_cut(judged, [np.ones(y.size) for y in readings]), _cut(judged, [weights_of_rows(y) for y in readings])]
-    number, labels = 0, []
-    for rows, starts, stops in zip(judged, firsts, ends, strict=True):
+    labels = []
+    of_each = _shares([float(len(a)) for a in firsts])
+    for rows, starts, stops, (first, count) in zip(judged, firsts, ends, of_each, strict=True):
         label = np.full(rows.size, -1, dtype=np.int64)
-        for a, b in zip(starts, stops, strict=True):
-            label[a:b] = np.where(rows[a:b], number * STRETCHES // windows, -1)
-            number += 1
+        for number, (a, b) in enumerate(zip(starts, stops, strict=True)):
+            label[a:b] = np.where(rows[a:b], first + number * count // len(starts), -1)
         labels.append(label)
     return [labels]
 
@@ -70,16 +70,30 @@ def _beyond_heads(rows: Sequence[int], firsts: Sequence[IntArray], ends: Sequenc
 
 
 def _cut(judged: Sequence[BoolArray], weights: Sequence[FloatArray]) -> list[IntArray]:
-    """Return the stretch of every row that is judged, stretches of as much weight each; -1 of the others."""
-    total = sum(float(w[rows].sum()) for rows, w in zip(judged, weights, strict=True))
-    labels, before = [], 0.0
-    for rows, w in zip(judged, weights, strict=True):
+    """Return the stretch of every row that is judged, those of one recording with as much weight each; -1 of others."""
+    of_each = _shares([float(w[rows].sum()) for rows, w in zip(judged, weights, strict=True)])
+    labels = []
+    for rows, w, (first, count) in zip(judged, weights, of_each, strict=True):
         label = np.full(rows.size, -1, dtype=np.int64)
-        told = before + np.cumsum(w[rows])
-        label[rows] = np.minimum((told - 0.5 * w[rows]) / total * STRETCHES, STRETCHES - 1).astype(np.int64)
-        before = float(told[-1]) if told.size else before
+        told = np.cumsum(w[rows])
+        if told.size:
+            label[rows] = first + np.minimum((told - 0.5 * w[rows]) / told[-1] * count, count - 1).astype(np.int64)
         labels.append(label)
     return labels
+
+
+def _shares(weights: Sequence[float]) -> list[tuple[int, int]]:
+    """Return the first stretch of each recording and how many it is cut into.
+
+    No stretch is of two recordings, so that none hangs on the order in which they are given; only where recordings are
+    more than stretches several share one.
+    """
+    if len(weights) > STRETCHES:
+        return [(number * STRETCHES // len(weights), 1) for number in range(len(weights))]
+    counts = np.ones(len(weights), dtype=np.int64)
+    while counts.sum() < STRETCHES:
+        counts[np.argmax(np.array(weights) / counts)] += 1
+    return [(int(end - count), int(count)) for end, count in zip(np.cumsum(counts), counts, strict=True)]
 
 
 def weights_of_rows(y: FloatArray) -> FloatArray:

@@ -61,3 +61,18 @@ def test_a_diagnosis_is_the_same_in_every_form(form: str) -> None:
     assert other.fit.extended == pytest.approx(one.fit.extended, rel=1e-4)
     coefficient = [found.effects[0].parameters["coefficient"].value for found in (one, other)]
     assert coefficient[1] == pytest.approx(coefficient[0], rel=1e-4)
+
+
+def test_recordings_in_another_order_tell_the_same() -> None:
+    """The first is shorter: of stretches cut through both, one after the other, each order had its own."""
+    others = [name for name in KINDS if name not in FEW]
+    shorter, longer = (
+        servo_recording(seed, lambda x, v: -0.2 * v * abs(v) / GAIN, rows=rows) for seed, rows in ((1, 700), (2, 900))
+    )
+    one, other = (diagnose(servo_model(), given, without=others) for given in ((shorter, longer), (longer, shorter)))
+    assert [e.name for e in one.effects] == ["plant.quadratic_drag"]
+    assert [(e.name, e.together) for e in other.effects] == [(e.name, e.together) for e in one.effects]
+    assert other.fit == one.fit
+    # it acts in the whole of each, counted as they were given
+    for found, given in ((one, (shorter, longer)), (other, (longer, shorter))):
+        assert set(found.effects[0].windows) == {(i, float(r.t[0]), float(r.t[-1])) for i, r in enumerate(given)}
