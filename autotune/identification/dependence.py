@@ -17,6 +17,7 @@ from scipy.special import log_ndtr, ndtr
 
 from autotune.arrays import FloatArray, is_constant
 from autotune.errors import IdentificationError
+from autotune.identification.lines import chance_of_lines, find_lines, without_lines
 from autotune.recording import Recording
 
 #: A probability below this is no chance.
@@ -32,6 +33,10 @@ _ROUNDING, _COMMAND = 1e-6, 1e-3
 #: u is fed back where y foretells more than half of its innovations' variance, and nothing but that where this is left.
 _FEEDBACK, _LEAST_OWN = 0.7, 3e-4
 _LEAST_RIDGE = 1e-10
+#: Rows within which a controller answers, its computer's delay included.
+_SOON = 8
+#: Innovations that are less than this part of a signal's spread may be what its waves leave, and no noise.
+_FORETOLD = 0.05
 #: Of the cause's energy, so much has to be left at a lag.
 _LEAST_ENERGY = 0.05
 #: By so much later than it does y may seem to answer: whitening smears.
@@ -298,17 +303,77 @@ def dependence(u: FloatArray, y: FloatArray, *, first_lag: int = 1, fed_back: bo
     u, y, first, every = _thin(_bridge(u), _bridge(y), first_lag)
     if min(u.size, y.size) < _LEAST_ROWS or is_constant(u) or is_constant(y):
         return Dependence(forward=1.0, backward=1.0, same_row=0.0, lag=0, sign=1, within=0)
+    found = _by_innovations(u, y, first, fed_back)
+    if not found.answers or _is_foretold(_innovations(y, _ROUNDING), y):
+        found = _by_lines(u, y, found, first, fed_back)
+    return replace(found, lag=found.lag * every, within=found.within * every)
+
+
+def _is_foretold(innovations: FloatArray, x: FloatArray) -> bool:
+    return float(np.std(innovations)) < _FORETOLD * float(np.std(x))
+
+
+def _are_waves(innovations: FloatArray, x: FloatArray) -> bool:
+    """Return whether innovations are waves that an autoregression has left: no chance of white noise holds for them.
+
+    References
+    ----------
+    Fisher, Tests of significance in harmonic analysis, Proc. R. Soc. A 125, 1929: the largest line beside all of them.
+    """
+    if not _is_foretold(innovations, x):
+        return False
+    lines = np.abs(np.fft.rfft(innovations)[1:]) ** 2
+    total = float(np.sum(lines))
+    share = float(np.max(lines)) / total if total > 0.0 else 1.0
+    return bool(lines.size * (1.0 - share) ** (lines.size - 1) < CHANCE)
+
+
+def _by_lines(u: FloatArray, y: FloatArray, found: Dependence, first: int, fed_back: bool) -> Dependence:
+    """Return how surely y answers the sines that u is, or u those of y, beside which no row is news."""
+    of_u, of_y = find_lines(u), find_lines(y)
+    if not (of_u.size or of_y.size):
+        return found
+    lines = of_u if of_u.size else of_y
+    left_u, left_y = without_lines(u, lines), without_lines(y, lines)
+    no_more_u = float(np.std(left_u)) <= _COMMAND * float(np.std(u))
+    no_more_y = float(np.std(left_y)) <= _COMMAND * float(np.std(y))
+    follows = 0.0 if no_more_u or no_more_y or not (first and fed_back) else _within_rows(left_y, left_u)
+    beside = replace(found, forward=1.0, backward=1.0, same_row=follows, lag=first, within=u.size // 4)
+    # an effect carries what its cause does beside the lines
+    if of_u.size and not beside.follows_in_row and (no_more_u or not no_more_y):
+        return replace(beside, forward=_chance_of_lines(y, left_y, of_u))
+    if of_y.size and no_more_y and not no_more_u:
+        return replace(beside, backward=_chance_of_lines(u, left_u, of_y))
+    return beside
+
+
+def _within_rows(cause: FloatArray, effect: FloatArray) -> float:
+    """Return the closest relation of innovations of an effect to those of its cause up to 8 rows before, in sd."""
+    e_cause, e_effect = _innovations(cause, _ROUNDING), _innovations(effect, _ROUNDING)
+    products = [float(e_cause[: e_cause.size - k] @ e_effect[k:]) for k in range(_SOON + 1)]
+    size = float(np.linalg.norm(e_cause) * np.linalg.norm(e_effect)) / math.sqrt(cause.size)
+    return max(products, key=abs) / size
+
+
+def _chance_of_lines(x: FloatArray, left: FloatArray, lines: FloatArray) -> float:
+    """Return how likely noise of the colour of what lines leave of a signal has as large a line as it."""
+    weights, _ = _autoregression(left, _ROUNDING)
+    x = x - x.mean()
+    return chance_of_lines(x[weights.size :] - _past(x, weights.size) @ weights, lines)
+
+
+def _by_innovations(u: FloatArray, y: FloatArray, first: int, fed_back: bool) -> Dependence:
+    """Return how surely what is new in y comes from what was new in u, and the other way round."""
     e_u, e_y = _innovations(u, _COMMAND), _innovations(y, _ROUNDING)
     forward, lag, sign, within = _closest(_own_moves(u, y, e_u) if first and fed_back else e_u, e_y, first)
     backward, *_ = _closest(_innovations(y, _COMMAND), _innovations(u, _ROUNDING), 1)
+    backward = 1.0 if _are_waves(e_u, u) else backward
     size = float(np.linalg.norm(e_u) * np.linalg.norm(e_y))
     same = float(e_u @ e_y) / size * math.sqrt(e_u.size) if size > 0.0 and first else 0.0
     # a controller's gain has the sign that turns the plant's answer back, where there is an answer
     if forward < CHANCE and lag == first and sign == np.sign(same):
         same = 0.0
-    return Dependence(
-        forward=forward, backward=backward, same_row=same, lag=lag * every, sign=sign, within=within * every
-    )
+    return Dependence(forward=forward, backward=backward, same_row=same, lag=lag, sign=sign, within=within)
 
 
 def _bridge(values: FloatArray) -> FloatArray:
@@ -350,14 +415,23 @@ def _thin(u: FloatArray, y: FloatArray, first_lag: int) -> tuple[FloatArray, Flo
 
 
 def _innovations(x: FloatArray, floor: float) -> FloatArray:
-    """Return what an autoregression leaves, its order by Akaike's criterion, with noise of so much of x's spread."""
+    """Return what an autoregression leaves, with noise of so much of x's spread; 0 in the first rows."""
     x = x - x.mean()
+    weights, level = _autoregression(x, floor)
+    return np.concatenate([np.zeros(weights.size), x[weights.size :] - _past(x, weights.size) @ weights - level])
+
+
+def _autoregression(x: FloatArray, floor: float) -> tuple[FloatArray, float]:
+    """Return the weights of the last rows that foretell the next one, their number by Akaike's criterion, and a level.
+
+    x has the mean 0.
+    """
     noise = floor * float(np.std(x))
     orders = [order for order in _ORDERS if order <= x.size // 8]
     most = orders[-1]
     past = np.column_stack([_past(x, most), np.full(x.size - most, np.std(x))])
     gram, right = past.T @ past, past.T @ x[most:]
-    best, found = math.inf, (1, np.zeros(2))
+    best, found = math.inf, np.zeros(2)
     for order in orders:
         used = [*range(order), most]
         ridge = noise**2 * past.shape[0] * np.eye(order + 1)
@@ -365,10 +439,8 @@ def _innovations(x: FloatArray, floor: float) -> FloatArray:
         left = x[most:] - past[:, used] @ weights
         criterion = left.size * math.log(float(np.mean(left**2)) + noise**2) + 2.0 * order
         if criterion < best:
-            best, found = criterion, (order, weights)
-    order, weights = found
-    innovations = x[order:] - _past(x, order) @ weights[:-1] - weights[-1] * np.std(x)
-    return np.concatenate([np.zeros(order), innovations])
+            best, found = criterion, weights
+    return found[:-1], float(found[-1] * np.std(x))
 
 
 def _closest(cause: FloatArray, effect: FloatArray, first: int) -> tuple[float, int, int, int]:

@@ -23,6 +23,7 @@ from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.dependence import is_fed_back
 from autotune.identification.equation_region import LEAST_SHARE, Equation, join_fits, largest_term
+from autotune.identification.lines import is_one_sine
 from autotune.identification.parametric import EXCLUDED, PlantFit, not_excluded
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
@@ -90,7 +91,8 @@ def fit_recordings(
     Raises
     ------
     IdentificationError
-        No structure is determined by the recordings; the reason is that of the simplest. Or points contradict all.
+        No structure is determined by the recordings, as by a single sine; the reason is that of the simplest. Or points
+        contradict all.
 
     Notes
     -----
@@ -99,6 +101,12 @@ def fit_recordings(
     feedback a zero would take up what the noise model leaves of the load that the controller answers. There the inverse
     of the controller, delayed, may fit best as well, as what the noise does comes back by it.
     """
+    if len(recordings) == 1 and is_one_sine(recordings[0].u):
+        raise IdentificationError(
+            "u is one sine: it tells gain and phase at its frequency, and a plant has a gain, a lag and a dead time",
+            where=recordings[0].name,
+            remedy="record sines of two frequencies or more, or steps",
+        )
     fits = _agreeing(recordings, _every_structure(recordings, progress), unbiased)
     if any(_one_in(one) > 1 for one in recordings):
         progress("fitting all rows", 0.9)

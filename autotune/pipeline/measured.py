@@ -21,7 +21,7 @@ from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
 #: recordings whose points say less than a fit of the whole record does; a relay's say more
-_PLAIN = ("random or steps", "repeated command", "closed loop by way of r")
+_PLAIN = ("random or steps", "repeated command", "sines", "closed loop by way of r")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -98,7 +98,7 @@ def frequency_points(recording: Recording, *, largest_relative_sd: float = 0.5) 
     ):
         return _of_relay(recording, segments, largest_relative_sd)
     estimate = points_of_spectra(recording, largest_relative_sd)
-    if estimate.excitation == "random or steps" and follows_in_row(recording):
+    if estimate.excitation in ("random or steps", "sines") and follows_in_row(recording):
         raise IdentificationError(
             "u and y move together within a row, as under a controller: y over u is then a mix of the plant and -1/C",
             where=recording.name,

@@ -14,6 +14,7 @@ from autotune.arrays import BoolArray, ComplexArray, FloatArray, is_constant
 from autotune.errors import IdentificationError
 from autotune.identification.frequency.excitation import repeat_length
 from autotune.identification.frequency.limit_cycle_points import LimitCycle
+from autotune.identification.frequency.line_points import line_points
 from autotune.identification.frequency.local_polynomial import LocalEstimate, local_estimate
 from autotune.identification.frequency.reference_model import ReferenceModel, fit_reference, simulate_reference
 from autotune.identification.frequency.spectra import Spectra, clean_measurement, common_rounding, record_spectra
@@ -21,7 +22,7 @@ from autotune.identification.parametric import PlantFit
 from autotune.points import FrequencyPoint
 from autotune.recording import Recording
 
-Excitation: TypeAlias = Literal["relay", "repeated command", "random or steps", "closed loop by way of r"]
+Excitation: TypeAlias = Literal["relay", "repeated command", "sines", "random or steps", "closed loop by way of r"]
 
 #: Frequencies per decade: the finer grid where it gives enough points, wider windows where the data are poorer.
 _PER_DECADE = (10, 5, 3, 2)
@@ -79,6 +80,11 @@ def points_of_spectra(recording: Recording, largest_relative_sd: float) -> Frequ
     t, u = recording.t, recording.u
     r = _moving_setpoint(recording)
     repeat = repeat_length(recording) if r is None else None
+    if r is None and repeat is None:
+        of_lines = line_points(t, u, y, held=recording.metadata.get("hold") != "linear")
+        sure = tuple(point for point in of_lines if _relative_sd(point) <= largest_relative_sd)
+        if sure:
+            return FrequencyEstimate(points=sure, excitation="sines")
     if repeat is not None:
         rows = repeat * (t.size // repeat)
         t, u, y = t[-rows:], u[-rows:], y[-rows:]
