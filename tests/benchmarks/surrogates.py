@@ -70,6 +70,21 @@ def _swapped(rng: np.random.Generator, rows: int) -> tuple[FloatArray, FloatArra
     return _driven(rng, u), u
 
 
+def _sines(rng: np.random.Generator, rows: int) -> FloatArray:
+    """Return two sines of 5 to 40 periods in the record."""
+    turns = 2.0 * np.pi * np.outer(np.arange(rows) / rows, rng.uniform(5.0, 40.0, 2))
+    return 5.0 + np.sum(0.5 * np.sin(turns + rng.uniform(0.0, 6.3, 2)), axis=1)
+
+
+def _under_sines(rng: np.random.Generator, rows: int) -> tuple[FloatArray, FloatArray]:
+    return _sines(rng, rows), lfilter([1.0], [1.0, -0.95], rng.standard_normal(rows))
+
+
+def _swapped_sines(rng: np.random.Generator, rows: int) -> tuple[FloatArray, FloatArray]:
+    u = _sines(rng, rows)
+    return _driven(rng, u), u
+
+
 def _wrong_sign(rng: np.random.Generator, rows: int) -> tuple[FloatArray, FloatArray]:
     u = _commands(rng, rows)
     return u, _driven(rng, u, -2.0)
@@ -123,7 +138,7 @@ def _limited(rng: np.random.Generator, rows: int) -> tuple[FloatArray, FloatArra
 FAMILIES: dict[str, Callable[[np.random.Generator, int], tuple[FloatArray, FloatArray]]] = {
     "white": _white, "white under steps": _stepping, "autoregressive": _autoregressive, "random walk": _walk,
     "swapped": _swapped, "wrong sign": _wrong_sign, "constant u": _constant, "linear loop": _loop,
-    "linear loop, limited": _limited,
+    "linear loop, limited": _limited, "noise under two sines": _under_sines, "swapped, two sines": _swapped_sines,
 }  # fmt: skip
 
 
@@ -206,7 +221,7 @@ COMMANDS: dict[str, Callable[[Recording, TransferFunction | None], bool]] = {
     "watch": _watch, "diagnose --routine": _routine, "diagnose": _diagnose,
 }  # fmt: skip
 #: Families whose columns are not what they are taken for, which is to be said.
-_MISREAD = ("swapped", "wrong sign")
+_MISREAD = ("swapped", "swapped, two sines", "wrong sign")
 #: A wrong sign is one beside a model only.
 _RIGHT = {("wrong sign", name) for name in COMMANDS if name != "diagnose"}
 

@@ -14,7 +14,7 @@ from autotune.identification.delay.drift import mean_over_window
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.output_error import Structure
-from autotune.identification.dependence import require_answer
+from autotune.identification.dependence import require_answer, require_order
 from autotune.models import Hold
 from autotune.recording import Recording
 
@@ -92,6 +92,8 @@ def track(
     ------
     InputError
         A window longer than the recording, or times that are not positive.
+    IdentificationError
+        Over the whole recording u answers y, and y does not answer u.
 
     Notes
     -----
@@ -113,6 +115,8 @@ def track(
             f"a window every {every_s:g} s on {end - begin:.4g} s makes {(end - begin) / every_s:.2g} of them",
             where=recording.name, remedy="give a longer time between them, or cut the recording at its gap",
         )  # fmt: skip
+    if not after_s > begin:  # what no window is long enough to tell
+        require_order([recording])
     ends = begin + window_s + every_s * np.arange(int((end - begin - window_s) / every_s + 1e-9) + 1)
     for at in ends[ends > after_s + 1e-6 * every_s]:
         if np.sum((recording.t > at - window_s) & (recording.t <= at)) < 2:

@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 import autotune as at
 from autotune.controller import PIDController
 from autotune.errors import IdentificationError
+from autotune.identification.delay.tracking import track
 from autotune.identification.dependence import CHANCE, dependence
 from autotune.identification.frequency.line_points import line_points
 from autotune.identification.lines import find_lines, is_one_sine
@@ -124,3 +125,10 @@ def test_what_else_repeats_itself_is_no_sine() -> None:
     rng = np.random.default_rng(2)
     for other in (np.sign(SINES["one"]), np.repeat(rng.choice([-1.0, 1.0], 60), 20), noise_of("lag", rng), T):
         assert not find_lines(other).size
+
+
+def test_no_window_of_swapped_columns_is_tracked() -> None:
+    """A window has too few periods to tell; the whole record has enough."""
+    swapped = Recording(t=T, u=answer(SINES["three"], 0.03), y=SINES["three"], name="test")
+    with pytest.raises(IdentificationError, match="u and y seem swapped"):
+        list(track(swapped, 2, window_s=200.0, every_s=100.0, max_delay_s=20.0))
