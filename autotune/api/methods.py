@@ -320,7 +320,7 @@ def delay(
     >>> abs(model.delay_s - 0.5) < 0.05
     True
     """
-    from autotune.identification.dependence import require_answer
+    from autotune.identification.answer import require_answer
 
     way = one_of(method, DELAY_METHODS, name="method", where="delay")
     order = int(number(order, name="order", where="delay", above=0, whole=True))
@@ -405,10 +405,10 @@ def closed_loop(
     >>> len(loop.poles)
     5
     """
+    from autotune.identification.answer import require_answer
     from autotune.identification.closed_loop.identify import identify_closed_loop
     from autotune.identification.closed_loop.methods import METHODS, Windows
     from autotune.identification.closed_loop.signals import model_of_recording
-    from autotune.identification.dependence import require_answer
 
     way = one_of(method, METHODS, name="method", where="closed_loop")
     if order is not None:

@@ -26,9 +26,9 @@ from autotune.diagnosis.result import Diagnosis
 from autotune.equations.recorded_units import require_units_of_model
 from autotune.errors import AutotuneError, IdentificationError
 from autotune.experiment_design.next_experiment import with_next_experiment
+from autotune.identification.answer import require_answer
 from autotune.identification.closed_loop.identify import identify_closed_loop
 from autotune.identification.closed_loop.loop_plant import loop_plant
-from autotune.identification.dependence import require_answer
 from autotune.identification.frequency.recorded import combine, frequency_points
 from autotune.identification.frequency.spectral_points import FrequencyEstimate
 from autotune.identification.parametric import PlantFit

@@ -21,7 +21,7 @@ from autotune.diagnosis.verdict import Evidence, judged
 from autotune.effects import require_known
 from autotune.equations.files import AnyModel
 from autotune.errors import InputError
-from autotune.identification.dependence import require_two_signals
+from autotune.identification.answer import require_two_signals
 from autotune.models import Model
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording

@@ -24,7 +24,7 @@ from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import KINDS, STRUCTURES, kind_of
 from autotune.equations.files import AnyModel
 from autotune.errors import InputError
-from autotune.identification.dependence import only_follows
+from autotune.identification.answer import only_follows
 from autotune.models import Effect
 from autotune.recording import Recording
 

@@ -1,31 +1,30 @@
-"""Whether y has anything to do with u: the question before every fit, since a fit always finds something.
+"""Whether one signal has anything to do with another: what is new in each, compared in order of time.
 
 Where y ran on by itself, what its own past does not foretell of it is white, and no past command can foretell it
 either. So y and u are each whitened by their own past, and the innovations of y are compared with those of u, alone and
 summed over 2, 4, ..., 256 rows, at all lags up to a quarter of the record. Only lags at which u came first count: what
 a controller makes of y follows y, and a loop that its own noise alone drives says nothing of the plant.
+No row of sines is new: whether y answers those is asked of its lines, and of what they leave.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import log_ndtr, ndtr
 
 from autotune.arrays import FloatArray, is_constant
-from autotune.errors import IdentificationError
 from autotune.identification.lines import chance_of_lines, find_lines, without_lines
-from autotune.recording import Recording
 
 #: A probability below this is no chance.
 CHANCE = 1e-3
 #: More rows are averaged; a smooth input, held linearly, needs fewer.
 _MOST_ROWS, _MOST_SMOOTH_ROWS = 16384, 4096
 _ORDERS = (1, 2, 4, 8, 16, 32)
-_LEAST_ROWS = 20
+#: Fewer rows tell nothing.
+LEAST_ROWS = 20
 #: Beyond so many standard deviations the innovations of one row belong together.
 _SAME_ROW = 4.0
 #: The spread of what whitening cannot take out, over the signal's own: noise of rounding, and of commands without any.
@@ -39,10 +38,6 @@ _SOON = 8
 _FORETOLD = 0.05
 #: Of the cause's energy, so much has to be left at a lag.
 _LEAST_ENERGY = 0.05
-#: By so much later than it does y may seem to answer: whitening smears.
-_SMEARED = 2.0
-#: One column is a copy of the other, in another unit, where less than this part of its spread is left.
-_COPY = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,195 +79,6 @@ class Dependence:
         return abs(self.same_row) > _SAME_ROW
 
 
-def recorded_dependence(recording: Recording) -> Dependence:
-    """Return how likely chance alone relates y so closely to u, or to a set-point that moves and acts by way of u."""
-    found = _of_columns(recording)
-    r = _moving_setpoint(recording)
-    if found.answers or r is None:
-        return found
-    by_setpoint = dependence(r, recording.y, fed_back=False)
-    return replace(by_setpoint, backward=found.backward, same_row=found.same_row, sign=found.sign)
-
-
-def is_fed_back(recording: Recording) -> bool:
-    """Return whether a controller makes u of y: a set-point moves, or u follows y within its row."""
-    return _moving_setpoint(recording) is not None or follows_in_row(recording)
-
-
-def follows_in_row(recording: Recording) -> bool:
-    """Return whether u follows y within its row, as what a controller makes of y does."""
-    return _of_columns(recording).follows_in_row
-
-
-def latest_answer_s(recording: Recording) -> float | None:
-    """Return the time within which y answers a command that a controller makes of it [s], None where that is not seen.
-
-    A dead time that is longer contradicts the record. In a loop that hardly anything but its own noise moves, a plant
-    of the other sign, dead for several periods of the loop, fits about as well as the true one: it is 1/C, delayed.
-    """
-    if _moving_setpoint(recording) is not None:
-        return None
-    found = _of_columns(recording)
-    if not found.follows_in_row or not found.answers:
-        return None
-    return _SMEARED * found.within * recording.sample_time_s
-
-
-def _of_columns(recording: Recording) -> Dependence:
-    return dependence(recording.u, recording.y, first_lag=0 if recording.metadata.get("hold") == "linear" else 1)
-
-
-def _moving_setpoint(recording: Recording) -> FloatArray | None:
-    """Return r, its gaps bridged, where it was recorded and moves."""
-    if (r := recording.extra.get("r")) is None:
-        return None
-    bridged = _bridge(r)
-    return None if is_constant(bridged) else bridged
-
-
-def require_order(recordings: Sequence[Recording]) -> None:
-    """Refuse recordings whose u answers y, within no row as a controller does, while y does not answer u.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Of one loop, at least one.
-
-    Raises
-    ------
-    IdentificationError
-        u and y seem swapped.
-
-    Notes
-    -----
-    Weaker than :func:`require_answer`: a loop that nothing but its own noise drives passes.
-    """
-    moving = _moving(recordings)
-    found = [recorded_dependence(recording) for recording in moving]
-    answers = any(one.answers for one in found) or any(map(_answers_a_test, moving, found))
-    if found and not answers and _seem_swapped(found):
-        raise _refusal_of_swapped(recordings)
-
-
-def only_follows(recordings: Sequence[Recording]) -> bool:
-    """Return whether u does nothing but follow y, as a controller does that nobody disturbs.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Of one plant, at least one.
-
-    Notes
-    -----
-    Of a linear plant such recordings say nothing: any that is 1/C, delayed, fits about as well as the true one.
-    """
-    moving = _moving(recordings)
-    found = [recorded_dependence(recording) for recording in moving]
-    return bool(found) and not _answer(moving, found) and _in_row(found)
-
-
-def _moving(recordings: Sequence[Recording]) -> list[Recording]:
-    """Return the recordings whose u moves."""
-    return [recording for recording in recordings if not is_constant(_bridge(recording.u))]
-
-
-def _answer(moving: Sequence[Recording], found: Sequence[Dependence]) -> bool:
-    """Return whether y answers u in one of the recordings, beyond what chance finds in so many."""
-    return min(one.forward for one in found) * len(found) < CHANCE or any(map(_answers_a_test, moving, found))
-
-
-def _in_row(found: Sequence[Dependence]) -> bool:
-    return any(one.follows_in_row for one in found)
-
-
-def _seem_swapped(found: Sequence[Dependence]) -> bool:
-    return min(one.backward for one in found) * len(found) < CHANCE and not _in_row(found)
-
-
-def _refusal_of_swapped(recordings: Sequence[Recording]) -> IdentificationError:
-    return IdentificationError(
-        "u and y seem swapped: u answers y, and y does not answer u",
-        where=", ".join(recording.name for recording in recordings),
-        remedy="name the columns the other way round with --u and --y",
-    )
-
-
-def require_answer(recordings: Sequence[Recording]) -> None:
-    """Refuse recordings in which y has nothing to do with u, and those whose columns say something else.
-
-    Parameters
-    ----------
-    recordings : sequence of Recording
-        Of one plant, at least one; it is enough if y answers in one of them.
-
-    Raises
-    ------
-    IdentificationError
-        Too few rows to tell, u never changes, y is a copy of u, the two are swapped, u does nothing but follow y, or y
-        does not answer u beyond chance (1 in 1,000).
-    """
-    if (most := max(map(len, recordings))) < _LEAST_ROWS:
-        raise IdentificationError(
-            f"{most} rows are too few to tell whether y answers u", where=recordings[0].name,
-            remedy=f"record for longer: {_LEAST_ROWS} rows at least",
-        )  # fmt: skip
-    moving = _moving(recordings)
-    if not moving:
-        raise IdentificationError(
-            "u is constant: the command never changes",
-            where=recordings[0].name,
-            remedy="record an experiment that moves u",
-        )
-    for recording in moving:
-        if len(recording) >= _LEAST_ROWS:
-            require_two_signals(recording)
-    found = [recorded_dependence(recording) for recording in moving]
-    if _answer(moving, found):
-        return
-    where = ", ".join(recording.name for recording in recordings)
-    if _seem_swapped(found):
-        raise _refusal_of_swapped(recordings)
-    if _in_row(found):
-        raise IdentificationError(
-            "u does nothing but follow y, as a controller does that nobody disturbs: this says nothing of the plant, "
-            "unless u and y are swapped",
-            where=where, remedy="record a set-point or a dither that moves the loop, or steps of u in open loop",
-        )  # fmt: skip
-    raise IdentificationError(
-        f"y has nothing to do with u beyond chance: noise alone does as much with a probability of "
-        f"{min(one.forward for one in found):.2g}, and at most {CHANCE:g} is accepted",
-        where=where, remedy="check the columns; record larger or longer moves of u, after some rest",
-    )  # fmt: skip
-
-
-def _answers_a_test(recording: Recording, found: Dependence) -> bool:
-    """Return whether y answers a few steps or ramps as a plant does, beyond what any colour of noise explains."""
-    from autotune.identification.plant_evidence import NEEDED, is_simple_test, plant_evidence
-
-    if found.follows_in_row or not is_simple_test(_bridge(recording.u)):
-        return False
-    return plant_evidence(recording) > NEEDED
-
-
-def require_two_signals(recording: Recording) -> None:
-    """Refuse a recording whose y is a copy of u, in another unit or with another zero.
-
-    Raises
-    ------
-    IdentificationError
-        It is one, to a millionth of its spread in every row.
-    """
-    u, y = _bridge(recording.u), _bridge(recording.y)
-    v, w = u - u.mean(), y - y.mean()
-    apart = w - (float(v @ w) / max(float(v @ v), 1e-300)) * v
-    if not is_constant(y) and not is_constant(u) and float(np.linalg.norm(apart)) <= _COPY * float(np.linalg.norm(w)):
-        raise IdentificationError(
-            "y is u, in every row, up to unit and offset: one signal under two names",
-            where=recording.name,
-            remedy="name the column of the measurement with --y",
-        )
-
-
 def dependence(u: FloatArray, y: FloatArray, *, first_lag: int = 1, fed_back: bool = True) -> Dependence:
     """Return how likely chance alone relates two signals so closely.
 
@@ -300,8 +106,8 @@ def dependence(u: FloatArray, y: FloatArray, *, first_lag: int = 1, fed_back: bo
     ----------
     Haugh, Checking the independence of two covariance-stationary time series, JASA 71, 1976.
     """
-    u, y, first, every = _thin(_bridge(u), _bridge(y), first_lag)
-    if min(u.size, y.size) < _LEAST_ROWS or is_constant(u) or is_constant(y):
+    u, y, first, every = _thin(bridge(u), bridge(y), first_lag)
+    if min(u.size, y.size) < LEAST_ROWS or is_constant(u) or is_constant(y):
         return Dependence(forward=1.0, backward=1.0, same_row=0.0, lag=0, sign=1, within=0)
     found = _by_innovations(u, y, first, fed_back)
     if not found.answers or _is_foretold(_innovations(y, _ROUNDING), y):
@@ -376,7 +182,14 @@ def _by_innovations(u: FloatArray, y: FloatArray, first: int, fed_back: bool) ->
     return Dependence(forward=forward, backward=backward, same_row=same, lag=lag, sign=sign, within=within)
 
 
-def _bridge(values: FloatArray) -> FloatArray:
+def bridge(values: FloatArray) -> FloatArray:
+    """Return a signal whose gaps are straight lines; 0 where it has no row.
+
+    Parameters
+    ----------
+    values : (N,) array
+        NaN where there is none.
+    """
     known = np.isfinite(values)
     if known.all() or not known.any():
         return np.where(known, values, 0.0)

@@ -89,7 +89,7 @@ class FittedLines:
     values : (M,) complex array
         Of each line exp(j omega t) from the first row on, in the signal's unit.
     covariances : (M, 2, 2) array
-        Of their real and imaginary parts.
+        Of their real and imaginary parts; NaN where no bin tells of the noise.
     sums : (M,) array
         Half the square of each value over the variance that noise gives it.
     bins : (M,) array
@@ -128,7 +128,7 @@ def fit_lines(x: FloatArray, frequencies: FloatArray) -> FittedLines:
         around = noise[far & (np.abs(bins - line) <= _AROUND)]
         its = slice(2 + 2 * number, 4 + 2 * number)
         each, (a, b) = covariance[its, its], solved[its]
-        level = float(np.mean(around)) if around.size else math.inf
+        level = float(np.mean(around)) if around.size else math.nan
         values.append(complex(a, -b))
         covariances.append(level * each * np.array([[1.0, -1.0], [-1.0, 1.0]]))
         sums.append(0.5 * float(solved[its] @ np.linalg.pinv(each) @ solved[its]) / max(level, 1e-300))

@@ -19,9 +19,9 @@ from scipy.optimize import minimize_scalar
 from autotune.arrays import FloatArray
 from autotune.distributions import chi2_tail
 from autotune.errors import AutotuneError, IdentificationError
+from autotune.identification.answer import is_fed_back
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
-from autotune.identification.dependence import is_fed_back
 from autotune.identification.equation_region import LEAST_SHARE, Equation, join_fits, largest_term
 from autotune.identification.lines import is_one_sine
 from autotune.identification.parametric import EXCLUDED, PlantFit, not_excluded

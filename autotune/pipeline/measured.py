@@ -9,7 +9,7 @@ import numpy as np
 
 from autotune.design.noise import LoopFacts, noise_of
 from autotune.errors import AutotuneError
-from autotune.identification.dependence import require_answer
+from autotune.identification.answer import require_answer
 from autotune.identification.frequency.recorded import combine, session_points, sessions
 from autotune.identification.frequency.spectral_points import FrequencyEstimate
 from autotune.identification.frequency.windows import read_noted_windows

@@ -16,7 +16,7 @@ from autotune.config.procedure import DesignSettings
 from autotune.controller import PIDController, read_controller
 from autotune.design.margins import margins
 from autotune.errors import IdentificationError
-from autotune.identification.dependence import require_answer
+from autotune.identification.answer import require_answer
 from autotune.identification.recorded_plant import fit_recordings
 from autotune.models import TransferFunction
 from autotune.pipeline import analyse, measure_plant

@@ -22,7 +22,7 @@ from autotune.diagnosis.routine.oscillation import (
 from autotune.diagnosis.routine.result import Oscillation, RoutineDiagnosis, Verdict
 from autotune.diagnosis.routine.thresholds import RoutineThresholds
 from autotune.diagnosis.routine.valves import ValveComparison, compare_valves
-from autotune.identification.dependence import require_order
+from autotune.identification.answer import require_order
 from autotune.recording import Recording
 
 

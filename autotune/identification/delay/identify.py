@@ -11,13 +11,13 @@ from dataclasses import replace
 import numpy as np
 
 from autotune.errors import IdentificationError, InputError
+from autotune.identification.answer import latest_answer_s
 from autotune.identification.delay.data import DelayData, PastInput, input_period, prepare
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.output_error import Point, Structure, minimise, residuals, solve_linear
 from autotune.identification.delay.output_error_model import finish, polish, widen_intervals
 from autotune.identification.delay.profile import profile
 from autotune.identification.delay.search import average_bins, scan, search
-from autotune.identification.dependence import latest_answer_s
 from autotune.identification.noise_colour import whitening_filter
 from autotune.models import Hold
 from autotune.progress import Progress, quiet

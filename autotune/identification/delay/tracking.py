@@ -9,12 +9,12 @@ import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.errors import IdentificationError, InputError
+from autotune.identification.answer import require_answer, require_order
 from autotune.identification.delay.data import prepare
 from autotune.identification.delay.drift import mean_over_window
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.output_error import Structure
-from autotune.identification.dependence import require_answer, require_order
 from autotune.models import Hold
 from autotune.recording import Recording
 

@@ -10,7 +10,7 @@ import numpy as np
 from autotune.arrays import is_constant
 from autotune.distributions import chi2_tail
 from autotune.errors import IdentificationError
-from autotune.identification.dependence import follows_in_row, require_answer
+from autotune.identification.answer import follows_in_row, require_answer
 from autotune.identification.frequency.excitation import relay_segments
 from autotune.identification.frequency.limit_cycle_points import limit_cycle_points
 from autotune.identification.frequency.spectral_points import FrequencyEstimate, points_of_spectra

@@ -16,14 +16,14 @@ import autotune as at
 from autotune.arrays import FloatArray
 from autotune.cli import app
 from autotune.errors import IdentificationError
-from autotune.identification.dependence import (
-    dependence,
+from autotune.identification.answer import (
     follows_in_row,
     only_follows,
     recorded_dependence,
     require_answer,
     require_order,
 )
+from autotune.identification.dependence import dependence
 from autotune.recording import Recording, write_recording
 from tests.benchmarks.surrogates import surrogate
 
