@@ -138,7 +138,7 @@ class Ball:
     def measure(self) -> float:
         """Return one sonar reading [V]."""
         if not self._noise:
-            half = self.settings.noise
+            half = self.settings.noise or 0.0  # of -0.0 as well, whose range numpy calls negative
             self._noise = self._random.uniform(-half, half, 4096).tolist()
         return self._convert(float(self._x[3]) + self._noise.pop())
 

@@ -88,6 +88,10 @@ def test_noise_is_uniform_of_the_given_half_width() -> None:
     assert readings.std() == pytest.approx(0.35 / math.sqrt(3.0), rel=0.02)
 
 
+def test_a_noise_of_minus_zero_is_none() -> None:
+    assert make_ball(noise=-0.0).measure() == make_ball(noise=0.0).measure()
+
+
 def test_both_converters_have_twelve_bits_over_ten_volts() -> None:
     ball = make_ball(seed=1)
     ball.advance(5.0004, 0.01)
