@@ -90,9 +90,10 @@ def _shares(weights: Sequence[float]) -> list[tuple[int, int]]:
     """
     if len(weights) > STRETCHES:
         return [(number * STRETCHES // len(weights), 1) for number in range(len(weights))]
-    counts = np.ones(len(weights), dtype=np.int64)
-    while counts.sum() < STRETCHES:
-        counts[np.argmax(np.array(weights) / counts)] += 1
+    told = np.array(weights)
+    counts = (told > 0.0).astype(np.int64)  # what has no row that is judged has no stretch
+    while 0 < counts.sum() < STRETCHES:
+        counts[np.argmax(told / np.maximum(counts, 1))] += 1
     return [(int(end - count), int(count)) for end, count in zip(np.cumsum(counts), counts, strict=True)]
 
 

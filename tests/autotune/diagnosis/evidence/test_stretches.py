@@ -10,7 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from autotune.diagnosis.evidence.stretches import (
+    STRETCHES,
     correlation_rows,
+    cuttings_in,
     cuttings_of,
     held_out_squares,
     weights_of_rows,
@@ -111,3 +113,15 @@ def _lags(*times_s):
     lags = (TransferFunction(num=(1.0,), den=(T, 1.0)) for T in times_s)
     blocks = tuple(Block(name=f"lag {k}", place="plant", dynamics=lag) for k, lag in enumerate(lags))
     return Model(name="lags", input=Port(), output=Port(), blocks=blocks)
+
+
+@given(rows=st.lists(st.integers(600, 900), min_size=1, max_size=8), windows=st.lists(st.integers(0, 12), min_size=8))
+def test_no_stretch_is_of_two_recordings(rows: list[int], windows: list[int]) -> None:
+    """Whichever way rows are cut; a recording without a window has none."""
+    readings = [np.random.default_rng(n).standard_normal(n).cumsum() for n in rows]
+    edges = [np.linspace(0, n, many + 1).astype(np.int64) for n, many in zip(rows, windows, strict=False)]
+    for labels in cuttings_in(readings, [e[:-1] for e in edges], [e[1:] for e in edges]):
+        held = [set(label[label >= 0].tolist()) for label in labels]
+        assert sum(map(len, held)) == len(set().union(*held))
+        assert [bool(one) for one in held] == [many > 0 for _, many in zip(rows, windows, strict=False)]
+        assert set().union(*held) == set(range(STRETCHES if any(held) else 0))
