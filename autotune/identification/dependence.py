@@ -109,8 +109,9 @@ def dependence(u: FloatArray, y: FloatArray, *, first_lag: int = 1, fed_back: bo
     u, y, first, every = _thin(bridge(u), bridge(y), first_lag)
     if min(u.size, y.size) < LEAST_ROWS or is_constant(u) or is_constant(y):
         return Dependence(forward=1.0, backward=1.0, same_row=0.0, lag=0, sign=1, within=0)
-    found = _by_innovations(u, y, first, fed_back)
-    if not found.answers or _is_foretold(_innovations(y, _ROUNDING), y):
+    e_y = _innovations(y, _ROUNDING)
+    found = _by_innovations(u, y, e_y, first, fed_back)
+    if not found.answers or _is_foretold(e_y, y):
         found = _by_lines(u, y, found, first, fed_back)
     return replace(found, lag=found.lag * every, within=found.within * every)
 
@@ -168,9 +169,9 @@ def _chance_of_lines(x: FloatArray, left: FloatArray, lines: FloatArray) -> floa
     return chance_of_lines(x[weights.size :] - _past(x, weights.size) @ weights, lines)
 
 
-def _by_innovations(u: FloatArray, y: FloatArray, first: int, fed_back: bool) -> Dependence:
-    """Return how surely what is new in y comes from what was new in u, and the other way round."""
-    e_u, e_y = _innovations(u, _COMMAND), _innovations(y, _ROUNDING)
+def _by_innovations(u: FloatArray, y: FloatArray, e_y: FloatArray, first: int, fed_back: bool) -> Dependence:
+    """Return how surely what is new in y, e_y, comes from what was new in u, and the other way round."""
+    e_u = _innovations(u, _COMMAND)
     forward, lag, sign, within = _closest(_own_moves(u, y, e_u) if first and fed_back else e_u, e_y, first)
     backward, *_ = _closest(_innovations(y, _COMMAND), _innovations(u, _ROUNDING), 1)
     backward = 1.0 if _are_waves(e_u, u) else backward

@@ -18,6 +18,8 @@ from autotune.arrays import ComplexArray, FloatArray
 _MOST_LINES, _LEAST_PERIODS = 8, 4.0
 #: a command is lines where they leave less than this part of its spread: a converter's steps, and hardly a corner
 _LEFT = 0.05
+#: of eight lines that are all of a signal the largest has an eighth of its variance; half of that where two are near
+_LEAST_HELD = 1.0 / 16.0
 #: where no more than this is left of it, there is no other line: two that are near each other are taken for one first
 _NOTHING = 1e-6
 #: lines nearer to each other than this part of a period in the record are none that it tells apart
@@ -45,9 +47,11 @@ def find_lines(x: FloatArray) -> FloatArray:
     left = x - x.mean()
     while frequencies.size < _MOST_LINES and float(np.std(left)) > _NOTHING * spread:
         spectrum = np.abs(np.fft.rfft(left * window, 4 * x.size))
-        if np.argmax(spectrum) < 4.0 * _LEAST_PERIODS:
+        peak = int(np.argmax(spectrum))
+        held = 2.0 * (float(spectrum[peak]) / float(np.sum(window))) ** 2  # variance of a sine of that height
+        if peak < 4.0 * _LEAST_PERIODS or held < _LEAST_HELD * float(np.var(left)):
             break
-        more = _refined(x, np.append(frequencies, np.argmax(spectrum) / (4.0 * x.size)))
+        more = _refined(x, np.append(frequencies, peak / (4.0 * x.size)))
         if np.any(np.diff(np.sort(more)) * x.size < _APART):
             break
         frequencies, left = more, without_lines(x, more)
