@@ -56,7 +56,7 @@ def corner_frequencies(*systems: TransferFunction, beside: float = 0.0) -> Float
     """
     found: list[float] = [beside] if beside > 0.0 else []
     for system in systems:
-        found.extend([*_roots(np.array(system.num)), *_roots(np.array(system.den))])
+        found.extend(root for p in (system.num, system.den) for root in _roots(np.array(p)) if root > 0.0)
         if system.delay_s > 0.0:
             found.append(min(1.0 / system.delay_s, 1e6 * max(found, default=math.inf)))
     return _sorted(found)

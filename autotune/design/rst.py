@@ -105,6 +105,8 @@ def place_poles(plant: TransferFunction, poles: Sequence[complex]) -> RST:
     scale = w ** np.arange(n, -1, -1.0)
     A = np.array(plant.den) * scale
     A, B = A / A[0], np.concatenate((np.zeros(n + 1 - len(plant.num)), plant.num)) * scale / A[0]
+    gain = float(np.max(np.abs(B))) or 1.0  # no unit of u or y decides whether the system is solvable
+    B = B / gain
     size = 2 * n + 1
     # unknowns: S = s^(n+1) + s_1 s^n + ... + s_n s, then R = r_0 s^n + ... + r_n
     matrix = np.zeros((size, size))
@@ -121,7 +123,7 @@ def place_poles(plant: TransferFunction, poles: Sequence[complex]) -> RST:
         raise DesignError("the plant has a common factor or a zero at s = 0", where="RST", remedy="cancel it first")
     x = np.linalg.solve(matrix, (P - known)[1:])
     S = np.concatenate(([1.0], x[:n], [0.0])) * w ** np.arange(n + 2)
-    R = x[n:] * w ** np.arange(1, n + 2)
+    R = x[n:] * w ** np.arange(1, n + 2) / gain
     return RST(R=_floats(R), S=_floats(S), T=(float(R[-1]),))
 
 

@@ -84,9 +84,10 @@ def test_a_plant_without_phase_lag_has_no_ultimate_point() -> None:
         ultimate_point(TransferFunction(num=(1.0,), den=(1.0, 1.0)))
 
 
-def test_poles_land_where_they_are_placed() -> None:
+@pytest.mark.parametrize("gain", [1.0, 1e-15, -1e15])
+def test_poles_land_where_they_are_placed_in_all_units(gain: float) -> None:
     poles = [-1.0, -2.0, -3.0 + 1.0j, -3.0 - 1.0j, -5.0]
-    plant = TransferFunction(num=(2.0, 3.0), den=(1.0, 1.0, 4.0))
+    plant = TransferFunction(num=(2.0 * gain, 3.0 * gain), den=(1.0, 1.0, 4.0))
     controller = place_poles(plant, poles)
     closed = np.polyadd(np.polymul(plant.den, controller.S), np.polymul(plant.num, controller.R))
     np.testing.assert_allclose(np.sort_complex(np.roots(closed)), np.sort_complex(np.array(poles)), rtol=1e-6)

@@ -54,11 +54,18 @@ def test_a_recording_in_other_units_gives_the_same_loop(recorded, of_u: float, o
     assert there.Ti_s == pytest.approx(here.Ti_s, rel=2e-4)
 
 
-@given(gain=st.floats(1e-6, 1e6), sign=st.sampled_from((-1.0, 1.0)), lag=st.floats(0.01, 1e3))
-@settings(max_examples=50)
-def test_a_plants_frequencies_and_its_noise_gain_follow_its_units(gain: float, sign: float, lag: float) -> None:
-    one = TransferFunction(num=(2.0,), den=(lag, 1.0))
-    other = TransferFunction(num=(2.0 * sign * gain,), den=(lag, 1.0))
+@given(
+    gain=st.floats(1e-12, 1e12), sign=st.sampled_from((-1.0, 1.0)), lag=st.floats(0.01, 1e3),
+    delay=st.sampled_from((0.0, 2.0)), level=st.booleans(),
+)  # fmt: skip
+@settings(max_examples=80)
+def test_a_plants_frequencies_and_its_noise_gain_follow_its_units(
+    gain: float, sign: float, lag: float, delay: float, level: bool
+) -> None:
+    """A level over a valve in pascal moves by 1e-12 m per Pa: its dead time stays what it is."""
+    den = (1.0, 0.0) if level and delay else (lag, 1.0)
+    one = TransferFunction(num=(2.0,), den=den, delay_s=delay)
+    other = TransferFunction(num=(2.0 * sign * gain,), den=den, delay_s=delay)
     np.testing.assert_allclose(sampled_plant(other, 50.0 / gain).omega, sampled_plant(one, 50.0).omega, rtol=1e-9)
     most = default_noise_gain(one, LoopFacts())[0]
     assert default_noise_gain(other, LoopFacts())[0] * gain == pytest.approx(most, rel=1e-9)
