@@ -207,4 +207,5 @@ class ChainEvidence(Evidence):
         lasting = not any(kind_of(name).at_a_time for name in self.names)
         comparable = lasting and bool(np.all(np.linalg.eigvals(build_chain(nominal).A).real < 0.0))
         able = (wanted, self.search.retuned.fit.model)
-        return safe_extension(able, nominal, self.measured, forecast, comparable=comparable), wanted
+        handed_out = safe_extension(able, nominal, self.measured, forecast, comparable=comparable, retuned=able[1])
+        return handed_out, wanted

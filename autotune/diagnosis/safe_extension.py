@@ -27,6 +27,7 @@ def safe_extension(
     forecast: Callable[[M, Recording], FloatArray],
     *,
     comparable: bool,
+    retuned: M | None = None,
 ) -> M:
     """Return the first of some models that is no danger beside the nominal one; the nominal one where none is.
 
@@ -42,22 +43,34 @@ def safe_extension(
         Simulates a model with a recording's u, its start told by the first readings: as ``autotune simulate`` does.
     comparable : bool
         Whether a free run through a recording says how near a model is: not of a plant that does not settle.
+    retuned : model, optional
+        The nominal model's own structure with other numbers.
 
     Notes
     -----
     A model must leave no larger squared error than the nominal one on the recordings as a whole, run as a person will
     run it, and stay within ten times the range of the nominal model and the readings on commands that reach
-    twice as far from their mean. Where the nominal model leaves ten times the range of the readings itself, as one of
+    twice as far from their mean. Where the retuned one is as near and goes farther there, others may go as far: that
+    is what the person's own physics says with the right numbers, as of a pendulum that goes over its top, and no danger
+    that comes with an extension. Where the nominal model leaves ten times the range of the readings itself, as one of
     an unstable plant does, it sets no bound: how far such runs go depends on every digit of their numbers. What a model
     does on inputs that look otherwise is not known.
     """
     stressed = [_stressed(r) for r in recordings]
     allowed = [_allowed(_reach(nominal, s, forecast), _range(r)) for s, r in zip(stressed, recordings, strict=True)]
     before = sum(_squares(nominal, r, forecast) for r in recordings) if comparable else np.inf
+
+    def is_as_near(model: M) -> bool:
+        return not comparable or sum(_squares(model, r, forecast) for r in recordings) <= before
+
+    if comparable and retuned is not None and is_as_near(retuned):
+        reached = [_reach(retuned, s, forecast) for s in stressed]
+        allowed = [
+            max(most, FARTHER * far if np.isfinite(far) else 0.0) for most, far in zip(allowed, reached, strict=True)
+        ]
     for model in models:
-        if all(_reach(model, s, forecast) <= most for s, most in zip(stressed, allowed, strict=True)) and (
-            not comparable or sum(_squares(model, r, forecast) for r in recordings) <= before
-        ):
+        bounded = (_reach(model, s, forecast) <= most for s, most in zip(stressed, allowed, strict=True))
+        if all(bounded) and is_as_near(model):
             return model
     return nominal
 

@@ -98,6 +98,10 @@ class Descent:
         other._data = [replace(one, good=new) for one, new, _ in each]
         return other
 
+    def begin_as(self, other: Descent) -> None:
+        """Begin with the damping at which another descent moved from the same place: about as much is needed again."""
+        self._damping, self._firmness = other._damping, other._firmness
+
     def _iterate(self, z: FloatArray, windows: list[Windows]) -> _Iterate | None:
         """Return parameters and start states with what they simulate, None where a run does not reach its end."""
         runs, errors, p = [], [], values_of(self._compiled, z)

@@ -87,4 +87,5 @@ def _refit_without(
     for k in range(count):
         there = begun.on_fewer_rows([one.good & (label != k) for one, label in zip(whole, labels, strict=True)])
         there.step(most=1)
+        begun.begin_as(there)
         yield k, there

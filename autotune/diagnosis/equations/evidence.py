@@ -132,7 +132,8 @@ class EquationEvidence(Evidence):
         lasting = not any(kind_of(name).at_a_time for name in self.names)
         comparable = lasting and (isinstance(nominal, BlackBox) or settles(nominal, self.given))
         able = (wanted, _with_numbers(nominal, self.found.retuned.outcome))
-        return safe_extension(able, nominal, self.given, forecast_any, comparable=comparable), wanted
+        handed_out = safe_extension(able, nominal, self.given, forecast_any, comparable=comparable, retuned=able[1])
+        return handed_out, wanted
 
     def _wanted(self, verdict: Verdict) -> EquationModel | BlackBox:
         """Return the nominal model where nothing is missing, else what explains more."""

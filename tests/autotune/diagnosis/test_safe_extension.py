@@ -72,6 +72,26 @@ def test_a_nominal_model_that_goes_as_far_sets_how_far_others_may_go() -> None:
     assert safe_extension((far,), linear, [recorded(linear)], as_it_is, comparable=False) is linear
 
 
+def test_what_the_persons_own_physics_does_with_the_right_numbers_is_no_danger() -> None:
+    """A pendulum of the right weight goes over its top on twice the command, and turns on."""
+
+    def turns(u: FloatArray) -> FloatArray:
+        return bent(u) * np.where(np.abs(u) > 1.2, 30.0, 1.0)
+
+    def turns_too(u: FloatArray) -> FloatArray:
+        return 0.98 * turns(u)
+
+    def handed_out(*models: Law, retuned: Law | None = None) -> Law:
+        return safe_extension(models, linear, [recorded(bent)], as_it_is, comparable=True, retuned=retuned)
+
+    assert handed_out(turns, turns_too) is linear
+    assert handed_out(turns, turns_too, retuned=turns_too) is turns
+    assert handed_out(turns_too, retuned=turns_too) is turns_too
+    assert handed_out(explodes, turns_too, retuned=turns_too) is turns_too
+    assert handed_out(turns, retuned=farther) is linear  # farther off than the nominal one: it says nothing
+    assert handed_out(breaks_off, retuned=breaks_off) is linear
+
+
 def test_a_nominal_model_that_runs_away_sets_no_bound() -> None:
     """A levitating magnet leaves its gap whatever its numbers are: one run goes a thousand times as far as another."""
 

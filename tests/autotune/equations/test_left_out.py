@@ -15,7 +15,7 @@ from autotune.equations.left_out import left_out_squares
 from autotune.equations.sensitivity import run_windows
 from autotune.equations.simulate import Run
 from autotune.recording import Recording
-from tests.autotune.equations.models import one_state
+from tests.autotune.equations.models import PENDULUM, model, one_state
 
 DT, ROWS, SD = 0.05, 900, 0.01
 LINEAR = one_state("b*u - a*x", {"a": 0.8, "b": 2.0})
@@ -67,6 +67,30 @@ def test_a_stretch_that_is_left_out_costs_the_simulations_of_its_move_alone(
     monkeypatch.setattr(descent, "run_windows", counted)
     left_out_squares(found, pair, labels, 3)
     assert len(pair) * 3 < len(runs) <= len(pair) * (1 + 2 * 3)
+
+
+def test_where_moves_must_be_short_one_stretch_tells_the_next_how_short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A spring in the place of gravity: of a pendulum that swings wide derivatives foresee little."""
+    rng = np.random.default_rng(1)
+    u, truth = np.repeat(rng.normal(0.0, 0.8, ROWS // 25), 25), compile_model(model())
+    drive = Drive(t=0.02 * np.arange(ROWS), inputs=u[:, None])
+    y = simulate(truth, truth.parameter_vector, drive, np.zeros((1, 2))).y
+    r = Recording(t=drive.t, u=u, y=y + 0.003 * rng.normal(size=ROWS))
+    states = [PENDULUM["state"][0], {**PENDULUM["state"][1], "derivative": "(u - c*omega - k*theta)/J"}]
+    numbers = {"J": {"value": 0.05}, "c": {"value": 0.02}, "k": {"value": 1.3}}
+    found = fit(compile_model(model(state=states, parameters=numbers)), [r])
+    labels, runs = [np.arange(ROWS) // (ROWS // 10)], []
+
+    def counted(*given: object, **named: object) -> Run:
+        runs.append(given)
+        return run_windows(*given, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(descent, "run_windows", counted)
+    squares = left_out_squares(found, [r], labels, 10)
+    monkeypatch.undo()
+    alone = [left_out_squares(found, [r], [np.where(labels[0] == k, 0, -1)], 1)[0] for k in range(10)]
+    assert len(runs) < 10 * 8
+    assert np.log(squares) == pytest.approx(np.log(alone), abs=0.05)  # no less of any of them is unseen
 
 
 def test_a_descent_on_fewer_rows_is_that_of_these_rows(pair: list[Recording]) -> None:
