@@ -52,6 +52,9 @@ _EXCEPTIONS = {
 _BUSY = (5, 6)
 #: first and longest wait before a busy device is asked again [s]: its dead-man runs meanwhile
 _BUSY_WAIT_S, _LONGEST_BUSY_WAIT_S = 0.005, 0.05
+#: longest wait for each answer of a device that opens a TLS session [s]: a small one takes a second to sign. Only where
+#: a rig is opened, before anything is commanded; a session that breaks in the loop has the time of one answer
+_HANDSHAKE_S = 5.0
 #: what the library raises where the line is gone, beside the line's own errors
 _LOST = (ConnectionException,)
 _READ = {
@@ -71,16 +74,19 @@ class _TcpClient(ModbusTcpClient):
 
     tls: ssl.SSLContext | None = None
     server_name: str = ""
+    handshake_s: float = 0.0
 
     def connect(self) -> bool:
         """Connect; return whether there is a connection."""
         if self.socket is not None:
             return True
-        address = (self.comm_params.host, self.comm_params.port)
-        plain = socket.create_connection(address, timeout=self.comm_params.timeout_connect)
+        address, wait_s = (self.comm_params.host, self.comm_params.port), self.comm_params.timeout_connect
+        plain = socket.create_connection(address, timeout=wait_s)
         try:
             plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            plain.settimeout(max(wait_s, self.handshake_s))
             self.socket = self.tls.wrap_socket(plain, server_hostname=self.server_name) if self.tls else plain
+            self.socket.settimeout(wait_s)
         except ssl.SSLError as error:
             plain.close()
             raise ConnectionException(f"TLS: {error}") from None
@@ -161,6 +167,8 @@ class ModbusLink:
         if self._client is None:
             self._client = _client(self._settings)
         is_new, is_first = self._client.socket is None, self._lock.take()
+        if isinstance(self._client, _TcpClient):
+            self._client.handshake_s = _HANDSHAKE_S if is_first else 0.0
         try:
             with line_errors(self.where, "no connection", "check address, cable and power", also=_LOST):
                 self._client.connect()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -415,6 +416,37 @@ def test_a_device_with_another_authoritys_certificate_or_name_is_refused(certifi
                 u_safe=0.0,
             )
         assert device.output == pytest.approx(0.1)  # nobody has moved anything
+
+
+def test_a_device_may_take_its_time_to_open_a_tls_session(certificates: Path) -> None:
+    """A small one signs for a second; ``timeout_s`` is the wait for an answer, not for that."""
+    sent: list[float] = []
+
+    def slow_to_sign(record: bytes, direction: str) -> Fate:
+        now = time.monotonic()
+        if direction == "to device":
+            return [(0.0, record)]
+        sent.append(now)
+        # what it says in its first half second comes at its end, in this order
+        return [(max(sent[0] + 0.5 + 1e-4 * len(sent) - now, 0.0), record)]
+
+    def record_length(head: bytes) -> int:
+        return 5 + int.from_bytes(head[3:5], "big")
+
+    transport = TcpTransport(
+        ca_file=str(certificates / "ca.pem"),
+        cert_file=str(certificates / "rig.pem"),
+        key_file=str(certificates / "rig.key"),
+    )
+    with (
+        ModbusRig(register_device(), transport) as server,
+        TcpRelay(server.port, slow_to_sign, record_length) as line,
+    ):
+        rig = rig_of(tls_settings(line.port, certificates, timeout_s=0.2))
+        rig.open()
+        assert time.monotonic() - sent[0] > 0.5
+        assert math.isfinite(rig.read().y)
+        rig.close()
 
 
 def test_make_safe_reconnects_where_the_link_came_back() -> None:
