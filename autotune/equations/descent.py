@@ -39,6 +39,8 @@ MOVES, WORTH_MOVING = 4, 0.1
 #: Weight of the belief that a start state is where it was, of what the readings tell of all, and by what it grows
 #: where a move fails: a state that readings hardly feel would jump, and hold up every number beside it.
 FIRMNESS, FIRMER = 1e-9, 10.0
+#: Damping at most that one descent begins with after another: where nothing helped there, the next one may still move.
+MOST_DAMPED = 1e3
 #: Times the median window's mean square from which on a window stands out and is started anew.
 STANDS_OUT = 4.0
 #: Windows at least of which one may stand out, and what of its mean square a new start may leave to be taken.
@@ -100,7 +102,7 @@ class Descent:
 
     def begin_as(self, other: Descent) -> None:
         """Begin with the damping at which another descent moved from the same place: about as much is needed again."""
-        self._damping, self._firmness = other._damping, other._firmness
+        self._damping, self._firmness = min(other._damping, MOST_DAMPED), other._firmness
 
     def _iterate(self, z: FloatArray, windows: list[Windows]) -> _Iterate | None:
         """Return parameters and start states with what they simulate, None where a run does not reach its end."""
