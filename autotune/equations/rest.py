@@ -105,7 +105,8 @@ def _fastest_rate(
     """Return the largest rate at which a change of all states by their sizes would undo itself [1/s]."""
     points = np.concatenate([states[None, :], states + np.diag(sizes)])
     slopes = derivatives(compiled, parameters, points, np.tile(inputs, (points.shape[0], 1)))[0]
-    moves = np.nansum(np.abs(slopes[1:] - slopes[0]), axis=0)
+    with np.errstate(invalid="ignore"):  # equations may have no value there: a gap of zero under a magnet
+        moves = np.nansum(np.abs(slopes[1:] - slopes[0]), axis=0)
     felt = (sizes > 0.0) & np.isfinite(moves)
     return float(np.max(moves[felt] / sizes[felt], initial=0.0))
 

@@ -8,6 +8,7 @@ compared. What has no unit in the file matches everything.
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -18,7 +19,18 @@ from autotune.errors import InputError
 
 #: Units that engineers write and the library of units does not know; they have no dimension.
 PLAIN = {"", "1", "-", "%", "count", "counts", "step", "steps", "lsb", "digit", "pu", "p.u.", "duty", "pwm"}
-_SPELT = {"°C": "degC", "°F": "degF", "°": "deg", "Ω": "ohm", "µ": "u", "²": "^2", "³": "^3", "·": " "}
+_SPELT = {"°C": "degC", "°F": "degF", "°": "deg", "Ω": "ohm", "µ": "u", "²": "^2", "³": "^3", "·": " ", "⋅": " ",
+          "Nm^3": "m^3", "Nm3": "m^3"}  # fmt: skip
+#: What engineers mean by names that the library of units knows as something else, or not at all: there Nm is a
+#: fineness of yarn, Nms are several of it, and cfm a hundredth of a femtometre.
+_MEANT = (
+    "newton_metre = newton * metre = Nm", "newton_metre_second = newton * metre * second = Nms",
+    "newton_second = newton * second = Ns", "pascal_second = pascal * second = Pas",
+    "volt_second = volt * second = Vs", "ampere_second = ampere * second = As", "watt_second = watt * second = Ws",
+    "cubic_foot_per_minute = foot ** 3 / minute = cfm", "acidity = 1 = pH", "hundredth = 0.01 = pct",
+)  # fmt: skip
+#: A power as plain text has it: m/s2, m s-2.
+_PLAIN_POWER = re.compile(r"(?<=[A-Za-z])(-?[1-9])\b")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,20 +71,31 @@ def _parse(text: str) -> Unit | None:
         return Unit(powers=(), factor=0.01 if text == "%" else 1.0)
     for given, known in _SPELT.items():
         text = text.replace(given, known)
+    found = _base_units(text) or _base_units(_PLAIN_POWER.sub(r"^\1", text))
+    if found is None:
+        return None
+    factor, base = found
+    powers = tuple(sorted((str(n), float(p)) for n, p in base._units.items() if str(n) != "radian"))
+    return Unit(powers=tuple((n.removeprefix("delta_"), p) for n, p in powers), factor=factor)
+
+
+def _base_units(text: str) -> tuple[float, Any] | None:
     registry = _registry()
     try:
         factor, base = registry.get_base_units(registry.parse_units(text, as_delta=True))
     except Exception:  # the library has many ways to say that it does not know
         return None
-    powers = tuple(sorted((str(n), float(p)) for n, p in base._units.items() if str(n) != "radian"))
-    return Unit(powers=tuple((n.removeprefix("delta_"), p) for n, p in powers), factor=float(factor))
+    return float(factor), base
 
 
 @lru_cache(maxsize=1)
 def _registry() -> Any:
     import pint
 
-    return pint.UnitRegistry()
+    registry = pint.UnitRegistry(on_redefinition="ignore")
+    for line in _MEANT:
+        registry.define(line)
+    return registry
 
 
 def understood(text: str) -> Unit | None:

@@ -14,6 +14,7 @@ from autotune.equations import Drive, EquationModel, combinations, compile_model
 from autotune.equations.fit import fit
 from autotune.equations.forecast import forecast
 from autotune.equations.parameter_scales import slopes_of, values_of
+from autotune.equations.read import equations_of
 from autotune.equations.rest import rest_state
 from autotune.errors import InputError
 from autotune.recording import Recording
@@ -77,6 +78,36 @@ def test_a_forecast_of_an_unstable_plant_stays_near_its_readings() -> None:
     for growth, error in (("x", 0.006), ("1.1*x", 0.04)):
         windows = forecast(one_state(f"{growth} + u - x^3"), rec, 0.3)
         assert np.sqrt(np.mean((windows - rec.y)[40:] ** 2)) < error
+
+
+def levitated(seed: int, rows: int = 1500, dt: float = 0.001, noise: float = 0.01) -> Recording:
+    """Return a ball under a magnet, held 10 mm below it by a controller that sees the true state."""
+    rng = np.random.default_rng(seed)
+    z, v, aim, u, y = 0.0105, 0.0, 0.0, np.empty(rows), np.empty(rows)
+    for k in range(rows):
+        if k % 60 == 0:
+            aim = 1e-3 * rng.choice([-1.0, 1.0])
+        y[k], u[k] = 1e3 * z, 1.0 + 300.0 * (z - 0.01 - aim) + 8.0 * v
+        for _ in range(10):
+            v += 0.1 * dt * (9.81 - 9.81e-4 * (u[k] / z) ** 2)
+            z += 0.1 * dt * v
+    return Recording(t=dt * np.arange(rows), u=u, y=y + noise * rng.normal(size=rows))
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_ball_under_a_magnet_is_forecast_nine_times_its_growth_ahead(seed: int) -> None:
+    r = levitated(seed)
+    ball = equations_of(
+        {
+            "name": "ball", "input": [{"column": "u"}], "output": {"value": "1000*z"},
+            "state": [{"name": "z", "kind": "position", "derivative": "v"},
+                      {"name": "v", "kind": "speed", "of": "z", "derivative": "9.81 - c*(u/z)^2"}],
+            "parameters": {"c": 9.81e-4},
+        },
+        "ball.toml",
+    )  # fmt: skip
+    error = (forecast(ball, r, 0.05) - r.y)[100:]  # what a state is off by grows ninefold until a window ends
+    assert np.sqrt(np.mean(error**2)) < 0.03
 
 
 def test_a_model_that_runs_away_from_every_start_is_refused() -> None:

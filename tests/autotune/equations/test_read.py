@@ -9,6 +9,7 @@ import pytest
 
 from autotune.equations import read_equations, write_equations
 from autotune.equations.read import equations_of
+from autotune.equations.units import understood
 from autotune.errors import InputError
 from autotune.models import Effect, Parameter
 from tests.autotune.equations.models import PENDULUM, model
@@ -116,3 +117,21 @@ def test_a_temperature_rise_in_kelvin_and_celsius_are_alike() -> None:
         "parameters": {"G": {"value": 2.0, "unit": "W/K"}, "C": {"value": 500.0, "unit": "J/degC"}},
     }  # fmt: skip
     assert equations_of(content, "oven.toml").columns == ("u", "room")
+
+
+@pytest.mark.parametrize(
+    ("written", "usual"),
+    [("Nm", "N m"), ("mNm", "mN m"), ("Nms/rad", "N m s/rad"), ("Vs/rad", "V s/rad"), ("Pas", "Pa s"),
+     ("pct", "%"), ("m/s2", "m/s^2"), ("m s-2", "m/s^2"), ("Nm3/h", "m^3/h"), ("cfm", "ft^3/min"), ("pH", "1")],
+)  # fmt: skip
+def test_units_are_read_as_engineers_write_them(written: str, usual: str) -> None:
+    found, wanted = understood(written), understood(usual)
+    assert found is not None
+    assert wanted is not None
+    assert found.powers == wanted.powers
+    assert found.factor == pytest.approx(wanted.factor, rel=1e-12)
+
+
+def test_a_motor_in_newton_metres_without_a_blank_is_accepted() -> None:
+    assert PENDULUM["input"][0]["unit"] == "N m"
+    assert model(input=[{"column": "u", "unit": "Nm"}]).inputs[0].unit == "Nm"

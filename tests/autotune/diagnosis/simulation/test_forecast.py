@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from autotune.diagnosis.simulation.forecast import forecast
+from autotune.equations.chain import from_chain
+from autotune.equations.forecast import forecast as of_equations
 from autotune.errors import InputError
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.recording import Recording
@@ -52,6 +54,28 @@ def test_the_error_of_a_right_models_forecast_is_the_noise() -> None:
     r = recorded()
     error = (forecast(integrator(), r, 3.0) - r.y)[300:]
     assert np.std(error) < 1.1 * 0.05
+
+
+@pytest.mark.parametrize("size", [1.0, 2.0**24, -(2.0**-24)])
+def test_a_forecast_is_the_same_in_every_unit_of_the_reading_and_as_equations(size: float) -> None:
+    r = recorded()
+    there = Recording(t=r.t, u=r.u, y=size * r.y)
+    first, *rest = integrator().blocks
+    scaled = replace(first, dynamics=TransferFunction(num=(2.0 * size,), den=(0.3, 1.0)))
+    model = replace(integrator(), blocks=(scaled, *rest))
+    usual = forecast(integrator(), r, 3.0)
+    np.testing.assert_allclose(forecast(model, there, 3.0) / size, usual, rtol=0.0, atol=1e-6)
+    # integrated to a tolerance where the chain is exact
+    np.testing.assert_allclose(of_equations(from_chain(model), there, 3.0) / size, usual, rtol=0.0, atol=1e-3)
+
+
+def test_a_forecast_that_runs_away_in_one_window_is_far_from_the_readings_there() -> None:
+    r = recorded(rows=600)
+    growth = TransferFunction(num=(1.0,), den=(0.002, -1.0))
+    wild = replace(integrator(), blocks=(Block(name="wild", place="plant", dynamics=growth),))
+    found = forecast(wild, r, 3.0)[150:]
+    assert np.all(np.isfinite(found))
+    assert np.max(np.abs(found)) > 1e5 * np.ptp(r.y)
 
 
 def test_without_a_horizon_the_state_comes_from_the_first_tenth() -> None:
