@@ -87,7 +87,7 @@ class Around:
     @property
     def largest(self) -> float:
         """How large the state or difference gets."""
-        return max(float(np.quantile(np.abs(self.v), 0.9)), 1e-12)
+        return max(float(np.quantile(np.abs(self.v), 0.9)), 1e-100)
 
     @property
     def span(self) -> float:

@@ -266,8 +266,7 @@ def _with_resonance(blocks: Blocks, values: Values) -> Blocks:
 
 
 def _resting_mode(u: FloatArray, y: FloatArray, values: Values) -> FloatArray:
-    omega = 2.0 * np.pi * values["frequency"]
-    return np.column_stack([y / omega**2, 0.0 * y])
+    return np.column_stack([y, 0.0 * y])
 
 
 def _with_slow_mode(blocks: Blocks, values: Values) -> Blocks:

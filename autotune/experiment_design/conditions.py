@@ -69,5 +69,6 @@ def as_recorded(found: Diagnosis) -> Conditions:
     limits = LimitSettings(
         u_min=float(u.min()), u_max=float(u.max()), u_safe=float(np.median(u)), y_min=float(y.min()),
         y_max=float(y.max()), swing=float(np.max(np.abs(y - centre))),
+        u_rate=float(np.ptp(u)) / recordings[0].sample_time_s,
     )  # fmt: skip
     return Conditions(limits=limits, y=centre, sample_time_s=recordings[0].sample_time_s, law=law)

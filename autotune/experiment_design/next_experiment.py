@@ -100,15 +100,20 @@ def _larger_swing(found: Diagnosis) -> NextExperiment:
     values = np.concatenate([getattr(r, on)[np.isfinite(getattr(r, on))] for r in recordings])
     middle, span = float(np.median(values)), float(np.ptp(values))
     rates = np.abs(np.linalg.eigvals(chain.A))
-    lag = 1.0 / max(float(np.min(rates[rates > 1e-6 * rates.max()], initial=math.inf)), 1e-6)
+    lag = 1.0 / float(np.min(rates[rates > 1e-6 * rates.max()], initial=math.inf))
     return NextExperiment(
         purpose="see where the mismatch comes from",
         kind="staircase",
         settings={
             "on": name,
-            "levels": [round(middle + share * span, 6) for share in (-0.5, -0.25, 0.0, 0.25, 0.5)],
-            "hold_s": round(min(5.0 * lag, 0.2 * recordings[0].duration_s), 3),
+            "levels": [_to_digits_of(span, middle + share * span) for share in (-0.5, -0.25, 0.0, 0.25, 0.5)],
+            "hold_s": float(f"{min(5.0 * lag, 0.2 * recordings[0].duration_s):.4g}"),
         },
         expected="gain, lag and start-up delay at every level and in both directions: what depends on level, on speed, "
         "on direction or on time shows separately",
     )
+
+
+def _to_digits_of(span: float, level: float) -> float:
+    """Return a level as precisely as its place in a span needs, a thousandth of it."""
+    return round(level, 3 - math.floor(math.log10(span))) if span > 0.0 else level

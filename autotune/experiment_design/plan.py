@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import expm
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.fitting.data import Data
@@ -22,6 +21,7 @@ from autotune.diagnosis.fitting.windows import model_lag_s, window_rows
 from autotune.diagnosis.result import Diagnosis
 from autotune.diagnosis.selection.hypothesis import Hypothesis
 from autotune.diagnosis.simulation.simulator import Simulator
+from autotune.diagnosis.simulation.transitions import transition_table
 from autotune.errors import InputError
 from autotune.experiment.excitation import KINDS, Excitation, On
 from autotune.experiment.limits import Envelope
@@ -164,7 +164,7 @@ def _scale_to_limits(sim: Simulator, conditions: Conditions, trial: Excitation) 
     room_y = SWING_SHARE * min(limits.swing, limits.y_max - centre, centre - limits.y_min)
     room_u = ROOM_SHARE * min(limits.u_max - u_hold, u_hold - limits.u_min)
     moved_y, moved_u = float(np.max(np.abs(planned.y - centre))), float(np.max(np.abs(planned.u - u_hold)))
-    return max(0.0, min(room_y / max(moved_y, 1e-12), room_u / max(moved_u, 1e-12)))
+    return max(0.0, min(room_y / max(moved_y, 1e-300), room_u / max(moved_u, 1e-300)))
 
 
 def predict_recording(
@@ -185,10 +185,9 @@ def predict_recording(
     """
     dt, centre, chain, limits = conditions.sample_time_s, conditions.y, sim.chain, conditions.limits
     envelope = Envelope(settings=limits, sample_time_s=dt, u_step=conditions.u_step)
-    n = chain.order
-    step = expm(np.block([[chain.A, chain.B[:, :1]], [np.zeros((1, n + 1))]]) * dt)
-    Ad, Bd, c = step[:n, :n], step[:n, n], chain.taps[3]
-    x, w_hold = _rest(sim, centre)
+    step = transition_table(chain.A, chain.B, dt, 1)[1]
+    Ad, Bd, c = step[:, : chain.order], step[:, chain.order], chain.taps[3]
+    x, w_hold = sim.rest_at(centre)
     u_hold = w_hold + sim.u_offset
     pattern = excitation.pattern(dt)
     y, u = np.empty(pattern.size), np.empty(pattern.size)
@@ -201,7 +200,7 @@ def predict_recording(
     before = u_hold
     for k, added in enumerate(pattern):
         y[k] = float(c @ x) + chain.gains[3] * late[0] + sim.y_offset
-        if not abs(y[k] - centre) < 1e3 * (1.0 + abs(centre) + limits.swing):
+        if not abs(y[k] - centre) < 1e3 * (abs(centre) + limits.swing):
             return None
         base, on_r = u_hold, excitation.on == "set-point"
         if law is not None and state is not None:
@@ -211,14 +210,6 @@ def predict_recording(
         late = [*late[1:], u[k] - sim.u_offset]
         x = Ad @ x + Bd * late[0]
     return Recording(t=np.asarray(dt * np.arange(pattern.size)), u=u, y=y)
-
-
-def _rest(sim: Simulator, y: float) -> tuple[FloatArray, float]:
-    """Return the state and the command from the operating point of rest at a reading."""
-    chain = sim.chain
-    lhs = np.block([[chain.A, chain.B[:, :1]], [chain.taps[3][None, :], np.array([[chain.gains[3]]])]])
-    rest = np.linalg.lstsq(lhs, np.append(np.zeros(chain.order), y - sim.y_offset), rcond=1e-12)[0]
-    return rest[: chain.order], float(rest[chain.order])
 
 
 def _rate_excitation(

@@ -69,7 +69,7 @@ def sizes_of(
     model: EquationModel, parameters: FloatArray, values: Mapping[str, FloatArray], inputs: FloatArray, dt_s: float
 ) -> dict[str, float]:
     """Return how large each state's derivative is, and the force at each port that would make the largest so large."""
-    sizes = {n: float(np.std(np.diff(values[n]) / dt_s)) + 1e-12 for n in model.state_names}
+    sizes = {n: float(np.std(np.diff(values[n]) / dt_s)) + 1e-300 for n in model.state_names}
     for port in model.ports:
         sizes[port.name] = _force_size(model, parameters, port.name, sizes, inputs)
     return sizes

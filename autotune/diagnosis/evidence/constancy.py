@@ -116,7 +116,7 @@ def largest_variation(result: Fit, data: Data) -> Variation:
     e = left.beyond_numbers(left.e)
     variance = float(e @ e) / left.rows
     lag, longest = model_lag_s(result.model), max(r.duration_s for r in data.recordings)
-    count = int(min(FASTEST * longest / max(lag, 1e-12), MOST_FREQUENCIES))
+    count = int(min(FASTEST * longest / max(lag, 1e-300), MOST_FREQUENCIES))
     columns = list(_columns(left))
     multiplied, added = list(_multiplied(left)), [*_bends(left), *_paths(left, lag), *columns]
     may_enter = _MAY_ENTER | {what: ("environment",) for _, what, _ in columns}

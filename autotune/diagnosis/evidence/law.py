@@ -78,7 +78,7 @@ class ShownLaw:
     def off(self) -> FloatArray:
         """How far each gain is from the stated one in standard deviations; 0 where that is too little to count."""
         change = np.abs(self.ratio - 1.0)
-        return np.where(self.clear & (change > self.least_change), change / np.maximum(self.sd, 1e-12), 0.0)
+        return np.where(self.clear & (change > self.least_change), change / np.maximum(self.sd, 1e-300), 0.0)
 
     @property
     def factors(self) -> dict[str, Parameter]:

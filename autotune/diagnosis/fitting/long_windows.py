@@ -61,19 +61,27 @@ def spread_of(data: Data) -> float:
     return float(np.std(np.concatenate([r.y[g] for r, g in zip(data.recordings, data.good, strict=True)]))) or 1.0
 
 
-def cut(recordings: Sequence[Recording], good: Sequence[BoolArray], length_s: float, limits: Thresholds) -> Data:
-    """Return recordings in windows of a length, thinned where they are long, their residuals taken for white."""
+def cut(
+    model: Model, recordings: Sequence[Recording], good: Sequence[BoolArray], length_s: float, limits: Thresholds
+) -> Data:
+    """Return recordings in windows of a length, thinned where they are long, their residuals taken for white.
+
+    No window starts before the first command that is known has come through the dead time: a start state stands for all
+    commands before it, but for those still on their way.
+    """
     starts, stops = [], []
     for r in recordings:
-        begins = r.t[r.first_reading]
+        late_s = sum(block.dynamics.delay_s for block in model.blocks) if np.ptp(r.u) > 0.0 else 0.0
+        begins = max(r.t[r.first_reading], r.t[0] + min(late_s, 0.5 * r.duration_s))
         count = max(1, round((r.t[-1] - begins) / length_s))
         edges = begins + (r.t[-1] - begins) / count * np.arange(count)
-        first = np.unique(np.searchsorted(r.t, edges - 1e-9)).astype(np.int64)
+        first = np.unique(np.searchsorted(r.t, edges - 1e-6 * r.sample_time_s)).astype(np.int64)
         starts.append(first)
         stops.append(np.append(first[1:], len(r)).astype(np.int64))
     data = Data(
-        recordings=tuple(recordings), good=tuple(good), starts=tuple(starts), stops=tuple(stops), noise=Noise(sd=1.0),
-        thresholds=limits,
+        recordings=tuple(recordings),
+        good=tuple(g & (np.arange(g.size) >= first[0]) for g, first in zip(good, starts, strict=True)),
+        starts=tuple(starts), stops=tuple(stops), noise=Noise(sd=1.0), thresholds=limits,
     )  # fmt: skip
     data = data.thinned(limits.rig_rows)
     return as_white(data, spread_of(data))

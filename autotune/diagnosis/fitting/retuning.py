@@ -104,7 +104,7 @@ def far_from_prior(result: Fit, sds: float) -> bool:
 def floor_noise(noise: Noise, recordings: Sequence[Recording]) -> Noise:
     """Return the noise, at least a millionth of the signal's spread: recordings without noise must not divide by 0."""
     spread = max(float(np.nanstd(r.y)) for r in recordings)
-    least = 1e-6 * spread or 1e-12
+    least = 1e-6 * spread or 1e-300
     return noise if noise.sd >= least else Noise(sd=least)
 
 

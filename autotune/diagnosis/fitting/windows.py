@@ -50,5 +50,5 @@ def window_rows(
     length = max(length_s, least * recording.sample_time_s)
     count = max(1, round(duration / length), min(thresholds.least_windows, len(recording) // least))
     edges = from_s + duration / count * np.arange(count)
-    starts = np.unique(np.searchsorted(recording.t, edges - 1e-9)).astype(np.int64)
+    starts = np.unique(np.searchsorted(recording.t, edges - 1e-6 * recording.sample_time_s)).astype(np.int64)
     return starts, np.append(starts[1:], len(recording))

@@ -78,8 +78,8 @@ def search_chain(
         progress("retuning on long windows", 0.0)
         lengths = lengths_of(model, recordings, limits)
         bench = Bench(
-            cuts=tuple(cut(recordings, good, length, limits) for length in lengths.between),
-            few=cut(recordings, good, lengths.short, limits), odds=_odds(model, recordings, left_out), pool=pool,
+            cuts=tuple(cut(model, recordings, good, length, limits) for length in lengths.between),
+            few=cut(model, recordings, good, lengths.short, limits), odds=_odds(model, recordings, left_out), pool=pool,
         )  # fmt: skip
         return search(_begin(model, bench), progress, known)
 

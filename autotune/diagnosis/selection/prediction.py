@@ -44,11 +44,11 @@ def signal_sizes(base: Fit, data: Data) -> SignalSizes:
     y = np.concatenate([r.y[g] for r, g in zip(data.recordings, data.good, strict=True)])
     signals = np.concatenate(base.signals)
     rates = np.abs(np.linalg.eigvals(sim.chain.A))
-    rates = rates[rates > 1e-9 * max(float(rates.max()), 1e-12)]
+    rates = rates[rates > 1e-9 * float(rates.max(initial=0.0))]
     duration = max(r.duration_s for r in data.driving)
     # an integrator alone has no time constant: half way, in logarithms, between a sample and a recording
     lag = 1.0 / float(rates.min()) if rates.size else float(np.sqrt(data.sample_times[0] * duration))
-    tiny = 1e-12
+    tiny = 1e-100  # of what never moves; its cube is a number still
 
     def largest(values: FloatArray) -> float:
         # the spikes that a differentiating controller puts into u say nothing of the sizes at work

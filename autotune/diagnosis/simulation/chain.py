@@ -98,7 +98,8 @@ class Chain:
     @property
     def is_integrating(self) -> bool:
         """Whether the chain has a pole at the origin."""
-        return bool(np.min(np.abs(np.linalg.eigvals(self.A))) < 1e-9) if self.order else False
+        poles = np.abs(np.linalg.eigvals(self.A))
+        return bool(np.min(poles) <= 1e-9 * np.max(poles)) if self.order else False
 
 
 def _realise(block: Block) -> tuple[FloatArray, FloatArray, FloatArray, float]:
@@ -205,9 +206,11 @@ def _arranged(
         a, b, c, d = _realise(block)
         n = b.size
         rests = -b[0] / a[0, 0] * commanded if n == 1 and a[0, 0] != 0.0 else 0.0
-        if block.place == "actuator" and rests != 0.0 and number < plant[0] and signals.where[ACTUATOR] < 0:
-            # which way a lag goes is told by the command beside its state: both in the command's unit
-            b, c, signals.where[ACTUATOR] = b / rests, c * rests, at
+        if block.place == "actuator" and rests != 0.0 and number < plant[0]:
+            # which way a lag goes is told by the command beside its state: both in the command's unit; others too, or
+            # their states would change with a lag that an effect puts in front of them
+            b, c = b / rests, c * rests
+            signals.where[ACTUATOR] = at if signals.where[ACTUATOR] < 0 else signals.where[ACTUATOR]
         commanded *= _gain(block) if block.dynamics.den[-1] != 0.0 else 0.0
         if number == plant[0]:
             taps[kernel.PLANT_IN], gains[2] = row, direct[0]

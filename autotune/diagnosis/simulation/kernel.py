@@ -264,10 +264,10 @@ def run(
             x[i] = states[0, window, i]
         # the command in force at the window's start, dead time counted, and when the next one arrives
         j = first
-        while j > 0 and _arrival(t, j, linear, effects) > t[first] + 1e-9:
+        while j > 0 and _arrival(t, j, linear, effects) > t[first] + 1e-6 * step:
             j -= 1
         comes = _arrival(t, j + 1, linear, effects)
-        while comes <= t[first] + 1e-9:
+        while comes <= t[first] + 1e-6 * step:
             j += 1
             comes = _arrival(t, j + 1, linear, effects)
         w = u[j] - u_offset

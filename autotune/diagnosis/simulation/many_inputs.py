@@ -15,7 +15,8 @@ from autotune.diagnosis.simulation.transitions import transition_table
 
 def first_command(chain: Chain, t: FloatArray, row: int) -> int:
     """Return the row whose command is in force at a row's time, dead time counted; the first one where none is yet."""
-    return max(int(np.searchsorted(t + chain.delay_s, t[row] + 1e-9, side="right")) - 1, 0)
+    now = t[row] + 1e-6 * (t[-1] - t[0]) / (t.size - 1)
+    return max(int(np.searchsorted(t + chain.delay_s, now, side="right")) - 1, 0)
 
 
 def responses(chain: Chain, t: FloatArray, inputs: FloatArray, rows: tuple[int, int, int], step_s: float) -> FloatArray:

@@ -225,13 +225,34 @@ class Simulator:
 
     def rest_states(self, u: FloatArray, y: FloatArray) -> FloatArray:
         """Return the states, (W, n), nearest to rest under commands, (W,), that give readings, (W,)."""
+        # least squares of: A x = -B w, and weighted: output = aim
+        wrong = np.vstack([np.outer(-self.chain.B[:, 0], u - self.u_offset), y - self.y_offset])
+        lhs = np.vstack([self.chain.A, self.chain.taps[kernel.OUTPUT]])
+        return np.ascontiguousarray(self._balanced(lhs, wrong, weight=1e3)[: self.order].T)
+
+    def rest_at(self, y: float) -> tuple[FloatArray, float]:
+        """Return the state, (n,), and the command from the operating point [u unit] of rest at a reading [y unit].
+
+        Parameters
+        ----------
+        y : float
+            Reading, absolute.
+        """
         chain = self.chain
-        # least squares of: A x = -B w (weighted), output = aim
-        weight = 1e3
-        scale = np.maximum(np.abs(chain.A).max(axis=1), 1e-12)
-        lhs = np.vstack([chain.A / scale[:, None], weight * chain.taps[kernel.OUTPUT]])
-        rhs = np.vstack([np.outer(-chain.B[:, 0] / scale, u - self.u_offset), weight * (y - self.y_offset)])
-        return np.ascontiguousarray(np.linalg.lstsq(lhs, rhs, rcond=1e-12)[0].T)
+        lhs = np.block([[chain.A, chain.B[:, :1]], [chain.taps[kernel.OUTPUT], chain.gains[3:4]]])
+        rest = self._balanced(lhs, np.append(np.zeros(self.order), y - self.y_offset)[:, None])[:, 0]
+        return rest[: self.order], float(rest[self.order])
+
+    def _balanced(self, lhs: FloatArray, rhs: FloatArray, weight: float = 1.0) -> FloatArray:
+        """Return a least-squares solution, states in their own sizes and rows in theirs, the last one weighted.
+
+        The units of the signals would decide else what gives way where not all can be.
+        """
+        sizes = np.append(np.where(self._answer > 0.0, self._answer, 1.0), 1.0)[: lhs.shape[1]]
+        scale = np.abs(lhs * sizes).max(axis=1, keepdims=True)
+        scale[scale == 0.0] = 1.0
+        scale[-1] /= weight
+        return np.asarray(sizes[:, None] * np.linalg.lstsq(lhs * sizes / scale, rhs / scale, rcond=1e-12)[0])
 
     def state_sizes(self, span: float, spread: float) -> FloatArray:
         """Return a size for every state: what the command's span makes of it, bounded by what the readings show.
@@ -239,21 +260,40 @@ class Simulator:
         Parameters
         ----------
         span, spread : float
-            Of all recordings, see :func:`autotune.diagnosis.simulation.assembly.spans_of`. Where no command moves, a
-            state has the size that moves the reading by its spread, by free motion from there.
+            Of all recordings, see :func:`autotune.diagnosis.simulation.assembly.spans_of`. A state that no command
+            moves has the size that moves the reading by its spread, by free motion from there.
         """
-        A, b, tap = self.chain.A, self.chain.B[:, 0], self.chain.taps[kernel.OUTPUT]
-        if span == 0.0 < spread:
-            fastest = max(float(np.abs(np.linalg.eigvals(A)).max()), 1e-9)
-            times = np.concatenate([[0.0], np.geomspace(0.05, 5.0, 8) / fastest])
-            moved = np.max([np.abs(tap @ expm(A * t)) for t in times], axis=0)
-            return np.asarray(spread / np.maximum(moved, 1e-12 * max(float(moved.max()), 1e-300)))
-        damped = A - 1e-3 * np.eye(self.chain.order) * max(float(np.abs(A).max()), 1e-9)
-        states = np.abs(np.linalg.solve(damped, b)) * span
-        states = np.where(np.abs(tap) > 0, np.minimum(states, spread / np.maximum(np.abs(tap), 1e-300)), states)
-        return np.asarray(np.maximum(states, 1e-9))
+        tap, states = self.chain.taps[kernel.OUTPUT], self._answer * span
+        if np.any(states == 0.0) and spread > 0.0:
+            times = np.concatenate([[0.0], np.geomspace(0.05, 5.0, 8) / self._fastest])
+            moved = np.max([np.abs(tap @ expm(self.chain.A * t)) for t in times], axis=0)
+            free = spread / np.maximum(moved, 1e-12 * max(float(moved.max()), 1e-300))
+            return np.where(states == 0.0, free, states)
+        read = tap != 0.0
+        states[read] = np.minimum(states[read], spread / np.abs(tap[read]))
+        return np.where(states == 0.0, 1.0, states)
+
+    @cached_property
+    def _answer(self) -> FloatArray:
+        """What commands of one make of the states, (n,): those that stay, and those that grow as fast as states move.
+
+        |(s I - A)^-1 B| at s a thousandth of the fastest rate (an integrator answers ever more) and past every rate: a
+        speed is as large as its position's rate, and not as small as what a constant command leaves of it.
+        """
+        A, b = self.chain.A, self.chain.B[:, 0]
+        rates = np.abs(np.linalg.eigvals(A))
+        grows = np.append(GROWTH * rates[rates > SLOWEST * self._fastest], SLOWEST * self._fastest)
+        found = [np.abs(np.linalg.solve(s * np.eye(self.order) - A, b)) for s in grows]
+        return np.asarray(np.max(found, axis=0))
+
+    @cached_property
+    def _fastest(self) -> float:
+        """The fastest rate of the chain [1/s]; 1 of integrators alone, which have none."""
+        return float(np.abs(np.linalg.eigvals(self.chain.A)).max(initial=0.0)) or 1.0
 
 
+#: Rates at which a command grows that states are sized by: the least, of the fastest rate, and factor on every rate.
+SLOWEST, GROWTH = 1e-3, 1.3
 _FORCED: tuple[StageName, ...] = tuple(name for name, stage in STAGES.items() if stage.is_force)
 #: Stages that the body asks for one by one.
 _TOLD: tuple[StageName, ...] = ("force", "friction", "outflow", "stop")

@@ -13,7 +13,9 @@ from scipy.linalg import expm
 
 from autotune.diagnosis.fitting.parameters import effect_with
 from autotune.diagnosis.simulation.assembly import assemble, spans_of
-from autotune.diagnosis.simulation.simulator import Windows
+from autotune.diagnosis.simulation.simulator import Simulator, Windows
+from autotune.diagnosis.simulation.transitions import transition_table
+from autotune.effects import KINDS
 from autotune.errors import InputError
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.recording import Recording
@@ -177,3 +179,59 @@ def test_a_recording_of_which_no_row_counts_says_nothing_of_the_states_sizes() -
     assert np.array_equal(sim.state_sizes(*spans_of([u, u], [nothing, y])), alone)
     assert np.array_equal(sim.state_sizes(*spans_of([u, u], [y, nothing])), alone)
     assert np.all(np.isfinite(sim.state_sizes(*spans_of([u], [nothing]))))
+
+
+@settings(max_examples=30)
+@given(
+    rates=st.lists(st.floats(0.1, 10.0), min_size=2, max_size=2, unique=True),
+    second=st.integers(-20, 20), gain=st.integers(-40, 40), step=st.floats(0.01, 3.0),
+)  # fmt: skip
+def test_a_transition_is_as_exact_in_all_units(rates: list[float], second: int, gain: int, step: float) -> None:
+    a, b = rates
+    A = np.array([[-a, 0.0], [2.0**gain, -b]]) * 2.0**-second
+    B = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]) * 2.0**-second
+    found = transition_table(A, B, step * 2.0**second)[-1]
+    usual = transition_table(np.array([[-a, 0.0], [1.0, -b]]), B * 2.0**second, step)[-1]
+    np.testing.assert_array_equal(found[1, [0, 2]], 2.0**gain * usual[1, [0, 2]])
+    np.testing.assert_allclose(usual[:, :2], expm(np.array([[-a, 0.0], [1.0, -b]]) * step), rtol=1e-9, atol=1e-12)
+
+
+@settings(max_examples=30)
+@given(second=st.integers(-20, 20), volt=st.integers(-40, 40), metre=st.integers(-40, 40), y=st.floats(-2.0, 2.0))
+def test_rest_and_sizes_of_states_are_in_proportion_to_the_signals(
+    second: int, volt: int, metre: int, y: float
+) -> None:
+    s, v, m = 2.0**second, 2.0**volt, 2.0**metre
+
+    def spring(s: float, v: float, m: float) -> Simulator:
+        lag = TransferFunction(num=(3.0,), den=(0.1 * s, 1.0))
+        arm = TransferFunction(num=(0.5 * m / v,), den=(1.0 * s**2, 1.4 * s, 12.0))
+        blocks = (Block(name="lag", place="actuator", dynamics=lag), Block(name="arm", place="plant", dynamics=arm))
+        return assemble(Model(name="arm", input=Port(), output=Port(), blocks=blocks))
+
+    units = np.array([v, m, m / s])  # of the lag's state, of the angle and of its rate
+    there, here = spring(s, v, m), spring(1.0, 1.0, 1.0)
+    # a reading that no rest under the command has: what gives way hangs on no unit
+    np.testing.assert_allclose(there.rest_state(0.7 * v, y * m), units * here.rest_state(0.7, y), rtol=1e-9, atol=0.0)
+    np.testing.assert_allclose(there.state_sizes(2.0 * v, 0.1 * m), units * here.state_sizes(2.0, 0.1), rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if kind.linear and kind.linear.start])
+@pytest.mark.parametrize("amplifier", [1.0, 30.0])
+def test_a_block_that_an_effect_adds_begins_at_rest_beside_the_others(name: str, amplifier: float) -> None:
+    lag = TransferFunction(num=(amplifier,), den=(0.1, 1.0))
+    slow = Block(name="oven", place="plant", dynamics=TransferFunction(num=(5.0,), den=(2.0, 1.0)))
+    part = KINDS[name].linear
+    assert part is not None
+    assert part.start is not None
+    driven = () if part.unless_lagged else (Block(name="amplifier", place="actuator", dynamics=lag),)
+    model = Model(name="oven", input=Port(), output=Port(), blocks=(*driven, slow))
+    values = {"share": 0.3, "frequency": 4.0, "damping": 0.1} | dict.fromkeys(
+        ("time_constant", "time_constant_up", "time_constant_down"), 0.4
+    )
+    added = effect(name, **{q.name: values[q.name] for q in KINDS[name].parameters})
+    small, large = assemble(model).chain, assemble(replace(model, effects=(added,))).chain
+    x = np.linalg.solve(small.A, -small.B[:, 0])
+    more = part.start(np.array([1.0]), np.array([small.taps[3] @ x]), added.values)[0]
+    x = np.concatenate([more, x] if part.at == "front" else [x, more])
+    np.testing.assert_allclose(large.A @ x + large.B[:, 0], 0.0, atol=1e-9 * np.abs(large.A).max() * np.abs(x).max())
