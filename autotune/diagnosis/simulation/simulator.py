@@ -260,17 +260,17 @@ class Simulator:
         Parameters
         ----------
         span, spread : float
-            Of all recordings, see :func:`autotune.diagnosis.simulation.assembly.spans_of`. A state that no command
-            moves has the size that moves the reading by its spread, by free motion from there.
+            Of all recordings, see :func:`autotune.diagnosis.simulation.assembly.spans_of`. Where no command moves, a
+            state has the size that moves the reading by its spread, by free motion from there.
         """
-        tap, states = self.chain.taps[kernel.OUTPUT], self._answer * span
-        if np.any(states == 0.0) and spread > 0.0:
+        tap = self.chain.taps[kernel.OUTPUT]
+        if span == 0.0 < spread:
             times = np.concatenate([[0.0], np.geomspace(0.05, 5.0, 8) / self._fastest])
             moved = np.max([np.abs(tap @ expm(self.chain.A * t)) for t in times], axis=0)
-            free = spread / np.maximum(moved, 1e-12 * max(float(moved.max()), 1e-300))
-            return np.where(states == 0.0, free, states)
-        read = tap != 0.0
-        states[read] = np.minimum(states[read], spread / np.abs(tap[read]))
+            return np.asarray(spread / np.maximum(moved, 1e-12 * max(float(moved.max()), 1e-300)))
+        states, read = self._answer * span, tap != 0.0
+        if spread > 0.0:
+            states[read] = np.minimum(states[read], spread / np.abs(tap[read]))
         return np.where(states == 0.0, 1.0, states)
 
     @cached_property

@@ -57,7 +57,7 @@ def test_what_was_commanded_before_a_part_begins_acts_in_it() -> None:
     play = Effect(name="actuator.backlash", parameters={"width": Parameter(value=width)})
     p = parametrise(model, [play], float(np.std(u)), 1.0, IN_USE.prior_spread)
     for part in parts_of((recording,), 100):
-        data = cut(part, [np.isfinite(r.y) for r in part], 600.0, IN_USE)
+        data = cut(model, part, [np.isfinite(r.y) for r in part], 600.0, IN_USE)
         there = fit_from(p, as_white(data, sd), p.centre, iterations=0, rounds=2)
         assert rms(there.residuals, data.good) < 1.1 * sd
 

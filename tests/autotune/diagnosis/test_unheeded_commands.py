@@ -39,7 +39,7 @@ def walking(u: np.ndarray) -> Recording:
 def of_chain(recording: Recording, lag_s: float) -> float | None:
     block = Block(name="lag", place="plant", dynamics=TransferFunction(num=(1.0,), den=(lag_s, 1.0)))
     model = Model(name="lag", input=Port(), output=Port(), blocks=(block,))
-    data = cut([recording], [np.ones(ROWS, dtype=bool)], recording.duration_s, IN_USE)
+    data = cut(model, [recording], [np.ones(ROWS, dtype=bool)], recording.duration_s, IN_USE)
     return error_beside_still(fit(parametrise(model, [], 1.0, DT), data), data)
 
 

@@ -105,7 +105,7 @@ def _fitted(errors, u=None, lag_s=0.0):
         drive = lag * drive + (1.0 - lag) * u[k]
         x = decay * x + (1.0 - decay) * drive
     recording = Recording(t=dt * np.arange(n), u=u, y=y + errors)
-    data = cut([recording], [np.ones(n, dtype=bool)], recording.duration_s, IN_USE)
+    data = cut(_lags(T), [recording], [np.ones(n, dtype=bool)], recording.duration_s, IN_USE)
     return recording, data, fit(parametrise(_lags(T), [], 0.5, dt), data)
 
 
