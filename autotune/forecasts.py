@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -292,7 +293,7 @@ class Forecaster:
 
         A past longer than any that there was before a forecast has not been tried: it was all rows, as shorter ones.
         """
-        y, ok = self.recording.y, self._known
+        y, ok = self.recording.y, self._read
         errors, total = np.zeros(len(CHOICES)), 0.0
         for origin, paths in tried:
             stop = min(now, origin + paths[0].size)
@@ -327,12 +328,18 @@ class Forecaster:
             found.append(done[start, force])
         return found
 
-    @property
-    def _known(self) -> BoolArray:
-        return np.isfinite(self.recording.y)
-
     def _bounded(self, path: FloatArray) -> FloatArray:
         """Return a path no farther from the readings than what stands for running away."""
-        low, high = np.nanmin(self.recording.y), np.nanmax(self.recording.y)
+        low, high = self._bounds
+        return np.clip(np.nan_to_num(path, nan=high), low, high)
+
+    # of the whole recording, and asked for in every window
+    @cached_property
+    def _read(self) -> BoolArray:
+        return np.isfinite(self.recording.y)
+
+    @cached_property
+    def _bounds(self) -> tuple[float, float]:
+        low, high = float(np.nanmin(self.recording.y)), float(np.nanmax(self.recording.y))
         far = FAR * max(high - low, abs(low), abs(high))
-        return np.clip(np.nan_to_num(path, nan=high + far), low - far, high + far)
+        return low - far, high + far

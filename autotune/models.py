@@ -264,6 +264,11 @@ class Model:
         return product
 
     @property
+    def delay_s(self) -> float:
+        """Dead time from the command to the reading, of all blocks together [s]."""
+        return sum(block.dynamics.delay_s for block in self.blocks)
+
+    @property
     def plant_input_unit(self) -> str:
         """Unit of the plant's input: an actuator's output as far as one is stated, else the command's."""
         return next((b.unit for b in self.blocks if b.place == "actuator" and b.unit), self.input.unit)

@@ -67,7 +67,7 @@ def chain_with_inputs(content: Mapping[str, Any], where: str) -> EquationModel:
 def _command(chain: Model, column: str) -> InputColumn:
     return InputColumn(
         column=column, unit=chain.input.unit, hold=chain.input.hold, offset=chain.input.offset,
-        delay_s=sum(block.dynamics.delay_s for block in chain.blocks),
+        delay_s=chain.delay_s,
     )  # fmt: skip
 
 

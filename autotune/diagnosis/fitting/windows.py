@@ -23,8 +23,7 @@ def known_from_s(model: Model, recording: Recording, thresholds: Thresholds = IN
     What was commanded before a recording begins is unknown: a slowest lag after the dead time it acts little
     more (through a dead time, a rate limit). No window begins before the first reading.
     """
-    delay = sum(block.dynamics.delay_s for block in model.blocks)
-    unknown = delay + model_lag_s(model)
+    unknown = model.delay_s + model_lag_s(model)
     from_s = float(recording.t[0] + min(unknown, thresholds.most_left_out * recording.duration_s))
     return max(from_s, float(recording.t[recording.first_reading]))
 

@@ -103,7 +103,7 @@ def _value(model: Model, free: Free) -> float:
     if free.kind == "u_offset":
         return model.input.offset
     if free.kind == "delay":
-        return sum(block.dynamics.delay_s for block in model.blocks)
+        return model.delay_s
     block = model.blocks[gain_block(model.blocks) if free.kind == "gain" else free.index[0]]
     num, den = block.dynamics.num, block.dynamics.settling_den
     if free.kind == "gain":

@@ -210,7 +210,8 @@ def _arranged(
             # which way a lag goes is told by the command beside its state: both in the command's unit; others too, or
             # their states would change with a lag that an effect puts in front of them
             b, c = b / rests, c * rests
-            signals.where[ACTUATOR] = at if signals.where[ACTUATOR] < 0 else signals.where[ACTUATOR]
+            if signals.where[ACTUATOR] < 0:
+                signals.where[ACTUATOR] = at
         commanded *= _gain(block) if block.dynamics.den[-1] != 0.0 else 0.0
         if number == plant[0]:
             taps[kernel.PLANT_IN], gains[2] = row, direct[0]
