@@ -128,15 +128,28 @@ def _in_order(
         return _diagnosis(alone.keeping(()), said=said_alone)
     parts = parts_of(recordings, LEAST_ROWS)
     progress("once more on parts of the rows", WHOLE)
-    said_there = [_said_on(part, alone) for part in parts]
+    there = [_told_by(part, alone) for part in parts]
     begins = {e.name: _begins(e, recordings) for e in found}
-    said = agreement(said_alone, begins, parts, said_there, 0.0, thresholds)
+    said = agreement(said_alone, begins, parts, [told_there for told_there, _ in there], 0.0, thresholds)
     agreed = evidence.keeping(likely(said))
     # what no part agrees on was found all the same, and may be what follows y whatever the command does
     explains = agreed if judged(agreed) == "effect" else alone
     if judged(agreed) != "unexplained" and (unheeded := explains.unheeded_commands()):
         return _diagnosis(agreed.keeping(()), unheeded)
+    named = _names(agreed, said)
+    nearer = agreed.predicting([errors for _, errors in there]) if named else agreed
+    if nearer is not agreed and _names(nearer, said) == named:
+        found_nearer = _diagnosis(nearer, said=said, kept=likely(said))
+        if not found_nearer.withheld:
+            return found_nearer
     return _diagnosis(agreed, said=said, kept=likely(said))
+
+
+def _names(evidence: Evidence, said: Mapping[str, float]) -> frozenset[str]:
+    """Return the effects that are named; none where the verdict is another."""
+    verdict = judged(evidence)
+    found = found_effects(evidence, verdict) if verdict == "effect" else ()
+    return likely(said) & {e.name for e in found}
 
 
 def _diagnosis(
@@ -183,10 +196,10 @@ def _begins(effect: FoundEffect, recordings: Sequence[Recording]) -> list[tuple[
     return [(i, start) for i, start, _ in effect.windows if start > float(recordings[i].t[0])]
 
 
-def _said_on(part: Part, whole: Evidence) -> Mapping[str, float]:
-    """Return what a part says, NaN of what it cannot tell; nothing where no simulation runs there."""
+def _told_by(part: Part, whole: Evidence) -> tuple[Mapping[str, float], Mapping[frozenset[object], float]]:
+    """Return what a part says, NaN of what it cannot tell, and errors there; nothing where no simulation runs."""
     there, untold = whole.on(part)
-    return {} if there is None else said_by(there) | dict.fromkeys(untold, math.nan)
+    return ({}, {}) if there is None else (said_by(there) | dict.fromkeys(untold, math.nan), there.errors)
 
 
 def _require_rows(recordings: Sequence[Recording]) -> None:

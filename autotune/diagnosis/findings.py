@@ -138,12 +138,17 @@ def places_of(evidence: Evidence, effects: Sequence[FoundEffect], description: D
 
 
 def beside(effects: Sequence[FoundEffect], evidence: Evidence) -> str:
-    """Return what is said of effects that predict, and that readings contradict."""
-    unnamed = evidence.contradicted - {e.name for e in effects}
-    if not unnamed:
-        return ""
-    what = "must be something else: readings scatter on where it would hold them still"
-    return f" The extended model predicts with {' and '.join(sorted(unnamed))} as well, which {what}."
+    """Return what is said of effects that predict and are not named: readings contradict them, or they are not sure."""
+    unnamed = set(evidence.names) - {e.name for e in effects}
+    said = {
+        "must be something else: readings scatter on where it would hold them still": unnamed & evidence.contradicted,
+        "is not sure enough to be called missing": unnamed - evidence.contradicted,
+    }
+    return "".join(
+        f" The extended model predicts with {' and '.join(sorted(names))} as well, which {what}."
+        for what, names in said.items()
+        if names
+    )
 
 
 def left_open(effects: Sequence[FoundEffect], evidence: Evidence, said: Mapping[str, float]) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ handed out; each says so in a class of its own, and all that follows asks no fur
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -17,7 +17,15 @@ from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.operating_point import Offset
 from autotune.diagnosis.evidence.samples import SampleEffect
 from autotune.diagnosis.result import FoundEffect, SearchResult, Verdict
-from autotune.diagnosis.selection.judged import Judged, each_best, of_likely, probabilities, rank
+from autotune.diagnosis.selection.judged import (
+    Judged,
+    each_best,
+    errors_of,
+    of_likely,
+    predicts_best,
+    probabilities,
+    rank,
+)
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.selection.search import Found
 from autotune.diagnosis.thresholds import Thresholds
@@ -139,6 +147,24 @@ class Evidence(ABC):
             return kept
         best = of_likely(self.found.judged, names)
         return kept if best.names == self.found.chosen.names else kept.going_on(best)
+
+    @property
+    def errors(self) -> Mapping[frozenset[object], float]:
+        """Errors of the hypotheses on left-out stretches, the logarithm of their squares."""
+        return {} if self.found is None else errors_of(self.found.judged)
+
+    def predicting(self, parts: Sequence[Mapping[frozenset[object], float]]) -> Self:
+        """Return the evidence with the hypothesis to simulate with: its effects, and those that predict beside them.
+
+        Parameters
+        ----------
+        parts : sequence of mapping of frozenset to float
+            Errors of the hypotheses on parts of the recordings; none where no simulation runs.
+        """
+        if self.found is None or self.own_noise or not self.names:
+            return self
+        best = predicts_best(self.found.chosen, self.found.judged, parts)
+        return self if best is self.found.chosen else self.going_on(best)
 
     @abstractmethod
     def going_on(self, best: Any) -> Self:

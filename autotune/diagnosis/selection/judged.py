@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self, TypeVar
@@ -19,7 +19,7 @@ from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.stretches import STRETCHES
 from autotune.diagnosis.selection.probability import Candidate, weighed
 from autotune.diagnosis.thresholds import Thresholds
-from autotune.effects import KINDS, forms_of, shared_name
+from autotune.effects import KINDS, forms_of, kind_of, shared_name
 from autotune.models import Effect
 
 #: Added to squared errors, for a stretch without rows has none.
@@ -225,6 +225,53 @@ def of_likely(found: Sequence[_J], likely: Collection[str]) -> _J:
     able = [one for one in found if set(one.names) <= set(likely)]
     most = max(len({shared_name(name) for name in one.names}) for one in able)
     return rank([one for one in able if len({shared_name(name) for name in one.names}) == most])[0]
+
+
+def errors_of(found: Sequence[Judged]) -> dict[frozenset[object], float]:
+    """Return the logarithm of squared errors on left-out stretches, of the best hypothesis of each set of effects."""
+    return {one.identity: one.log_squares for one in each_best(found)}
+
+
+def predicts_best(base: _J, found: Sequence[_J], parts: Sequence[Mapping[frozenset[object], float]]) -> _J:
+    """Return what simulates rows that were left out best: a hypothesis, or one with further effects of the rig.
+
+    What claims must be likelier than not; what predicts need only predict. An effect that is too rare to be named may
+    still take away what the named ones leave, and stay away from what else the recordings had around them.
+
+    Parameters
+    ----------
+    base : Judged
+        The hypothesis of the effects that are named.
+    found : sequence of Judged
+        All hypotheses, on all rows.
+    parts : sequence of mapping of frozenset to float
+        Errors of the same hypotheses, fitted and judged on each part of the rows (:func:`errors_of`).
+
+    Returns
+    -------
+    Judged
+        The one with the least mean logarithm of the errors on all rows and on the parts: no larger one on any of them,
+        and the mean less by a share that is material. The given one where there is none, where no part tells, and where
+        what it leaves is noise. What came from the surroundings, or at a time, is not in another recording.
+    """
+    sets = [errors_of(found), *parts]
+    if base.leaves_noise or not parts or any(base.identity not in told for told in sets):
+        return base
+
+    def mean(one: Judged) -> float:
+        return float(np.mean([told[one.identity] for told in sets]))
+
+    def is_able(one: Judged) -> bool:
+        further = [kind_of(name) for name in {*one.names} - {*base.names}]
+        lasts = all(kind.place != "environment" and not kind.at_a_time for kind in further)
+        return (
+            base.identity < one.identity
+            and lasts
+            and all(told.get(one.identity, math.inf) < told[base.identity] for told in sets)
+        )
+
+    best = min(filter(is_able, each_best(found)), key=mean, default=base)
+    return best if 0.5 * (mean(best) - mean(base)) < math.log(1.0 - base.limits.material) else base
 
 
 def probabilities(found: Sequence[_J], best: _J, unknown_odds: float) -> tuple[Candidate, ...]:
