@@ -83,7 +83,8 @@ class EquationBench(Bench):
         # further columns drive nothing until an effect takes them; what is measured runs on between rows
         measured = (InputColumn(column=name, hold="linear") for name in self._further)
         whole = replace(model, inputs=(*model.inputs, *measured))
-        super().__init__(whole, recordings, good, len(model.parameters), limits)
+        told = [ok & _is_told(model, r) for ok, r in zip(good, recordings, strict=True)]
+        super().__init__(whole, recordings, told, len(model.parameters), limits)
         dt = max(float(np.median(np.diff(r.t))) for r in recordings)
         longest = min(self._duration_s / WINDOWS, MOST_ROWS * dt)
         rate = growth_rate(model, recordings) if model.horizon_s is None else 0.0
@@ -371,3 +372,17 @@ class EquationBench(Bench):
         lines = standing_out(max(outcome.fitted.residuals, key=len), self._dt_s)
         return Signals(u=u, y=y, values=values, sizes=self._sizes, columns=columns, lines=lines, dt_s=self._dt_s,
                        duration_s=self._duration_s, slow_s=0.05 * self._duration_s)  # fmt: skip
+
+
+def _is_told(model: EquationModel, recording: Recording) -> BoolArray:
+    """Return at which rows commands of the recording act: those before are on their way through a dead time.
+
+    A start state stands for what was commanded before it, but not for what is still to come. A start that is given
+    is that of the first row.
+    """
+    late_s = max((one.delay_s for one in model.inputs if np.ptp(recording[one.column]) > 0.0), default=0.0)
+    if any(state.start is not None for state in model.states):
+        late_s = 0.0
+    t = recording.t
+    told: BoolArray = t >= t[0] + min(late_s, 0.5 * recording.duration_s) - 1e-6 * recording.sample_time_s
+    return told
