@@ -235,8 +235,8 @@ def errors_of(found: Sequence[Judged]) -> dict[frozenset[object], float]:
 def predicts_best(base: _J, found: Sequence[_J], parts: Sequence[Mapping[frozenset[object], float]]) -> _J:
     """Return what simulates rows that were left out best: a hypothesis, or one with further effects of the rig.
 
-    What claims must be likelier than not; what predicts need only predict. An effect that is too rare to be named may
-    still take away what the named ones leave, and stay away from what else the recordings had around them.
+    A name is a claim, and must be likelier than not; a model that is simulated with need only predict. An effect that
+    is not sure enough to be named may take away most of what the named ones leave.
 
     Parameters
     ----------
