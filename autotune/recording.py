@@ -196,6 +196,13 @@ class Recording:
         """Row of the first reading; 0 where there is none."""
         return int(np.argmax(np.isfinite(self.y)))
 
+    def told_from_s(self, late_s: float) -> float:
+        """Return the time from which commands of the recording act behind a dead time, its middle at the latest [s].
+
+        Those that were given before it began are on their way until then, and are not known.
+        """
+        return float(self.t[0] + min(late_s, 0.5 * self.duration_s))
+
     @check_arguments
     def read_from(self, row: int) -> Recording:
         """Return the recording without the readings before a row; what was commanded before it stays."""

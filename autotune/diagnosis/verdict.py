@@ -151,7 +151,7 @@ class Evidence(ABC):
     @property
     def errors(self) -> Mapping[frozenset[object], float]:
         """Errors of the hypotheses on left-out stretches, the logarithm of their squares."""
-        return {} if self.found is None else errors_of(self.found.judged)
+        return {} if self.found is None else errors_of(each_best(self.found.judged))
 
     def predicting(self, parts: Sequence[Mapping[frozenset[object], float]]) -> Self:
         """Return the evidence with the hypothesis to simulate with: its effects, and those that predict beside them.

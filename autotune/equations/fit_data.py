@@ -121,8 +121,7 @@ def data_of(
     if good.sum() < 8:
         raise InputError("fewer than 8 finite readings", where=recording.name, remedy="record longer")
     if windows is None:
-        given = any(state.start is not None for state in compiled.model.states)  # at the first row
-        first = 0 if given else recording.first_reading
+        first = 0 if compiled.model.has_given_start else recording.first_reading
         starts, stops = (rows + first for rows in window_rows(recording.t[first:], length_s))
         read = np.add.reduceat(good, starts) > 0  # a window without a reading tells nothing
         starts, stops = starts[read], stops[read]

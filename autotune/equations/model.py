@@ -188,6 +188,11 @@ class EquationModel:
         return tuple(parameter.name for parameter in self.parameters)
 
     @property
+    def has_given_start(self) -> bool:
+        """Whether the value of a state at the first row of each recording is given."""
+        return any(state.start is not None for state in self.states)
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """Columns of the recording that drive the model, in the order of every input matrix."""
         return tuple(one.column for one in self.inputs)

@@ -381,8 +381,7 @@ def _is_told(model: EquationModel, recording: Recording) -> BoolArray:
     is that of the first row.
     """
     late_s = max((one.delay_s for one in model.inputs if np.ptp(recording[one.column]) > 0.0), default=0.0)
-    if any(state.start is not None for state in model.states):
+    if model.has_given_start:
         late_s = 0.0
-    t = recording.t
-    told: BoolArray = t >= t[0] + min(late_s, 0.5 * recording.duration_s) - 1e-6 * recording.sample_time_s
+    told: BoolArray = recording.t >= recording.told_from_s(late_s) - 1e-6 * recording.sample_time_s
     return told

@@ -72,7 +72,7 @@ def cut(
     starts, stops = [], []
     for r in recordings:
         late_s = model.delay_s if np.ptp(r.u) > 0.0 else 0.0
-        begins = max(r.t[r.first_reading], r.t[0] + min(late_s, 0.5 * r.duration_s))
+        begins = max(r.t[r.first_reading], r.told_from_s(late_s))
         count = max(1, round((r.t[-1] - begins) / length_s))
         edges = begins + (r.t[-1] - begins) / count * np.arange(count)
         first = np.unique(np.searchsorted(r.t, edges - 1e-6 * r.sample_time_s)).astype(np.int64)

@@ -227,9 +227,9 @@ def of_likely(found: Sequence[_J], likely: Collection[str]) -> _J:
     return rank([one for one in able if len({shared_name(name) for name in one.names}) == most])[0]
 
 
-def errors_of(found: Sequence[Judged]) -> dict[frozenset[object], float]:
-    """Return the logarithm of squared errors on left-out stretches, of the best hypothesis of each set of effects."""
-    return {one.identity: one.log_squares for one in each_best(found)}
+def errors_of(leading: Sequence[Judged]) -> dict[frozenset[object], float]:
+    """Return the logarithm of squared errors on left-out stretches, of hypotheses that differ in their effects."""
+    return {one.identity: one.log_squares for one in leading}
 
 
 def predicts_best(base: _J, found: Sequence[_J], parts: Sequence[Mapping[frozenset[object], float]]) -> _J:
@@ -254,7 +254,8 @@ def predicts_best(base: _J, found: Sequence[_J], parts: Sequence[Mapping[frozens
         and the mean less by a share that is material. The given one where there is none, where no part tells, and where
         what it leaves is noise. What came from the surroundings, or at a time, is not in another recording.
     """
-    sets = [errors_of(found), *parts]
+    leading = each_best(found)
+    sets = [errors_of(leading), *parts]
     if base.leaves_noise or not parts or any(base.identity not in told for told in sets):
         return base
 
@@ -270,7 +271,7 @@ def predicts_best(base: _J, found: Sequence[_J], parts: Sequence[Mapping[frozens
             and all(told.get(one.identity, math.inf) < told[base.identity] for told in sets)
         )
 
-    best = min(filter(is_able, each_best(found)), key=mean, default=base)
+    best = min(filter(is_able, leading), key=mean, default=base)
     return best if 0.5 * (mean(best) - mean(base)) < math.log(1.0 - base.limits.material) else base
 
 
