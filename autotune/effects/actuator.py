@@ -15,6 +15,7 @@ from autotune.effects.base import (
     ACTUATOR_LAG,
     NEVER,
     EffectKind,
+    Extent,
     Quantity,
     Scan,
     SignalSizes,
@@ -28,6 +29,9 @@ from autotune.models import Block, TransferFunction
 
 _LJUNG = "Ljung, System Identification, 2nd ed., sec. 5.1"
 _ASTROM = "Astrom and Hagglund, Advanced PID Control, 2006, ch. 9"
+#: How far a converter's step is moved at first, as a share of what takes it a level off across the command's span, and
+#: its origin, as a share of the step; how small a part of that is at last.
+_MOVES, _LEAST_MOVE = (0.5, 0.1), 1.0 / 16.0
 #: Bands of stiction that are tried: the smallest and the largest as a share of the command's size, count.
 _BANDS_TRIED = (0.002, 0.6, 75)
 
@@ -66,9 +70,12 @@ def converted(u: float, step: float, origin: float) -> float:
     return origin + step * math.floor((u - origin) / step + 0.5)
 
 
-def _levels_around(values: Values, span: float, wide: float, turn: float) -> list[Values]:
-    """Return a converter's steps and origins around; ``wide`` moves the last level within the span by that share."""
-    step, origin = values["step"], values["origin"]
+def _levels_around(values: Values, extent: Extent, share: float) -> list[Values]:
+    """Return a converter's steps, a part of what takes one a level off across u's span, and origins around."""
+    if share < _LEAST_MOVE:
+        return []
+    step, origin, span = values["step"], values["origin"], extent.span
+    wide, turn = (share * most for most in _MOVES)
     return [
         {"step": step * (1.0 + i * wide * step / max(span, step)), "origin": origin + k * turn * step}
         for i in (-1, 0, 1)

@@ -105,6 +105,15 @@ class Quantity:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Extent:
+    """How far recordings go: the span of their commands [u unit], the longest one's duration, and a sample time [s]."""
+
+    span: float
+    duration_s: float
+    dt_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class SignalSizes:
     """Sizes of the signals in the recordings, from which starting values follow.
 
@@ -335,7 +344,8 @@ class EffectKind:
     lasting : bool
         Whether that search is long and its result hardly depends on what else is fitted: it is made once.
     moves : callable, optional
-        Given values, the span of the commands, and two shares; returns values around them that no derivative leads to.
+        Given values, the recordings' extent and a share, 1 at first; returns values around them that no derivative
+        leads to, the nearer the smaller the share is, and none where they are as near as matters.
     rough : bool
         Whether thresholds make local minima: a fit takes more steps.
     impacts : bool
@@ -397,7 +407,7 @@ class EffectKind:
     starts: Starts = no_starts
     search: Callable[[Scan], list[tuple[float, ...]]] | None = None
     lasting: bool = False
-    moves: Callable[[Values, float, float, float], list[Values]] | None = None
+    moves: Callable[[Values, Extent, float], list[Values]] | None = None
     rough: bool = False
     impacts: bool = False
     stand_in: Callable[[Fitted], bool] | None = None

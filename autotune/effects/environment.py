@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from autotune.effects.base import LEVEL, NEVER, EffectKind, Quantity, Scan, lacking
+from autotune.effects.base import LEVEL, NEVER, EffectKind, Extent, Quantity, Scan, lacking
 from autotune.effects.in_equations import LOADED, Around, InEquations, Tried
 from autotune.effects.stages import Line, Values
 from autotune.models import Parameter
@@ -199,6 +199,12 @@ def _step_of(name: str, unit: str) -> tuple[Quantity, ...]:
     )
 
 
+def _times_around(values: Values, extent: Extent, share: float) -> list[Values]:
+    """Return times before and after one of change, a sixteenth of a recording away at first, half a sample at last."""
+    shift = share * extent.duration_s / 16.0
+    return [{"time": values["time"] + side * shift} for side in (-1.0, 1.0)] if shift > 0.5 * extent.dt_s else []
+
+
 def _without_lag(values: Values) -> tuple[str, dict[str, float]] | None:
     """Return a column that acts at once in place of one behind a lag."""
     at_once = {key: value for key, value in values.items() if key != "time_constant"}
@@ -224,6 +230,7 @@ ENVIRONMENT = (
         parameters=_step_of("amplitude", "{f}"),
         lines=(Line(stage="load", does=stepped),),
         search=_step_times,
+        moves=_times_around,
         acts_in=_acts_in,
         places=_PLACES,
         at_a_time=True,
@@ -300,6 +307,7 @@ ENVIRONMENT = (
         lines=(Line(stage="command", does=_regained),),
         sought="rig",
         search=_switch_times,
+        moves=_times_around,
         acts_in=_acts_in,
         places=_PLACES,
         at_a_time=True,
@@ -315,6 +323,7 @@ ENVIRONMENT = (
         sought="rig",
         suits=LEVEL,
         search=_switch_times,
+        moves=_times_around,
         acts_in=_acts_in,
         places=_PLACES,
         at_a_time=True,

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.fit import Fit, fit, fit_from, residual_at
+from autotune.diagnosis.fitting.descent import bounded
+from autotune.diagnosis.fitting.fit import RUNAWAY, STEPS, Fit, fit, fit_from, residual_at
 from autotune.diagnosis.fitting.parameters import Parametrisation
 from autotune.effects import kind_of
-from autotune.effects.base import EffectKind
+from autotune.effects.base import EffectKind, Extent
 from autotune.effects.stages import Values
 
-#: How far effects are moved at first: for a converter its step as a share of what takes it a level off across u's span,
-#: its origin as a share of the step; how often these are halved.
-MOVES, HALVINGS = (0.5, 0.1), 5
+#: Decrease of the cost for which an effect is moved: of chi-square, or as a share of it where model error and not noise
+#: is its unit.
+LEAST_GAIN, LEAST_SHARE = 1.0, 0.02
 #: How often start states are found anew at most.
 RENEWALS = 3
 
@@ -50,7 +53,7 @@ def renew_start_states(result: Fit, data: Data) -> Fit:
 
 
 def realign_effects(result: Fit, data: Data) -> Fit:
-    """Return a fit whose effects were moved to where no derivative leads, where that explains more.
+    """Return a fit whose effect was moved to where no derivative leads, where that explains more.
 
     Parameters
     ----------
@@ -59,28 +62,32 @@ def realign_effects(result: Fit, data: Data) -> Fit:
 
     Notes
     -----
-    Every point of u that a converter's step takes to another level jumps: the criterion is a narrow well that
-    derivatives do not show. Steps and origins around are tried, all other numbers and the start states following to
-    first order.
+    Every point of u that a converter's step takes to another level jumps, and a time of change acts from row to row:
+    the criterion is a narrow well that derivatives do not show. Values around are tried, all other numbers and the
+    start states following to first order, then what leaves least is fitted. Of several such effects it is the one that
+    was added last.
     """
-    moved = next((e for e in result.parametrisation.model.effects if kind_of(e.name).moves is not None), None)
-    if moved is None:
+    effects = result.parametrisation.model.effects
+    number = next((i for i in reversed(range(len(effects))) if kind_of(effects[i].name).moves is not None), -1)
+    if number < 0:
         return result
-    number = result.parametrisation.model.effects.index(moved)
-    kind, span = kind_of(moved.name), max(float(np.ptp(r.u)) for r in data.driving)
-    at: Values = result.model.effects[number].values
-    before = best = _moved(result, data, kind, number, at)
-    wide, turn = MOVES
-    for _ in range(HALVINGS):
-        for there in kind.moves(at, span, wide, turn) if kind.moves is not None else ():
-            tried = _moved(result, data, kind, number, there)
-            if tried.cost < best.cost:
-                best = tried
-        at, wide, turn = best.values, 0.5 * wide, 0.5 * turn
+    kind = kind_of(effects[number].name)
+    extent = Extent(
+        span=max(float(np.ptp(r.u)) for r in data.driving),
+        duration_s=max(r.duration_s for r in data.driving),
+        dt_s=max(data.sample_times),
+    )
+    before = best = _moved(result, data, kind, number, result.model.effects[number].values)
+    share, able = 1.0, True
+    while able:
+        tried = kind.moves(best.values, extent, share) if kind.moves is not None else []
+        best = min((best, *(_moved(result, data, kind, number, there) for there in tried)), key=lambda one: one.cost)
+        share, able = 0.5 * share, bool(tried)
     if best is before:
         return result
-    again = fit(best.parametrisation, data, best.theta, result.x0, iterations=30, inherit=result)
-    return realign_effects(again, data) if again.cost < result.cost - data.thresholds.beyond_chance else result
+    again = fit(best.parametrisation, data, best.theta, result.x0, iterations=STEPS, inherit=result)
+    better = again.cost < result.cost - min(LEAST_GAIN, LEAST_SHARE * result.cost)
+    return realign_effects(again, data) if better else result
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,5 +115,8 @@ def _moved(result: Fit, data: Data, kind: EffectKind, number: int, values: Value
             held[key] = values[key]
     effects[number] = effects[number].with_values(held)
     p = replace(p, model=replace(p.model, effects=tuple(effects)))
-    left = result.without_numbers(result.without_states(residual_at(p, data, theta, result.x0)))
-    return _Moved(values=values, parametrisation=p, theta=theta, cost=float(left @ left))
+    cost = math.inf
+    with suppress(*RUNAWAY):
+        left = result.without_numbers(result.without_states(residual_at(p, data, theta, result.x0)))
+        cost = float(left @ left) if bounded(left) else math.inf
+    return _Moved(values=values, parametrisation=p, theta=theta, cost=cost)

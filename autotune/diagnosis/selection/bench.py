@@ -16,9 +16,10 @@ from autotune.diagnosis.fitting.data import Data, as_white
 from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, fit_from, start_states
 from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.parameters import Parametrisation
+from autotune.diagnosis.fitting.restarts import realign_effects
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
 from autotune.diagnosis.selection.judged_chain import JudgedChain
-from autotune.diagnosis.selection.refits import move_time_of_change
+from autotune.diagnosis.simulation.assembly import states_that_stay
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects.base import EffectKind
 from autotune.models import Effect
@@ -138,7 +139,7 @@ class Bench:
             while (sd := residual_sd(result, self.long)) < CLOSER * bench.long.noise.sd:
                 bench = self._at(sd)
                 closer = fit(result.parametrisation, bench.long, result.theta, result.x0, iterations=STEPS)
-                result = move_time_of_change(closer, bench.long)
+                result = realign_effects(closer, bench.long)
             return bench._judged(result, log_odds)
         except RUNAWAY:
             return None
@@ -156,6 +157,24 @@ class Bench:
             short_squares=held_out_squares(short, self.few) if self.two_scales else squares,
             log_odds=log_odds,
         )
+
+
+def fit_without(result: Fit, index: int, data: Data) -> Fit | None:
+    """Fit again without one of the effects that a fit adds; nothing where the simulation runs away without it."""
+    p = result.parametrisation
+    index += p.own  # the nominal model's own effects stay
+    keep = [i for i, f in enumerate(p.free) if f.kind != "effect" or f.index[0] != index]
+    moved = [
+        replace(f, index=(f.index[0] - 1, f.index[1])) if f.kind == "effect" and f.index[0] > index else f
+        for f in (p.free[i] for i in keep)
+    ]
+    effects = tuple(e for i, e in enumerate(p.model.effects) if i != index)
+    x0 = [x[:, states_that_stay(p.model.effects[index].name, x.shape[1])] for x in result.x0]
+    smaller = replace(p, model=replace(p.model, effects=effects), free=tuple(moved), centre=p.centre[keep])
+    try:
+        return fit(smaller, data, result.theta[keep], x0, iterations=20, rounds=2)
+    except RUNAWAY:
+        return None
 
 
 def residual_sd(result: Fit, data: Data) -> float:

@@ -22,12 +22,11 @@ from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit,
 from autotune.diagnosis.fitting.long_windows import cut, lengths_of
 from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.fitting.restarts import realign_effects
-from autotune.diagnosis.selection.bench import Bench, at_once, residual_sd
+from autotune.diagnosis.selection.bench import Bench, at_once, fit_without, residual_sd
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
 from autotune.diagnosis.selection.judged import each_best, rank
 from autotune.diagnosis.selection.judged_chain import JudgedChain, at_both_scales
 from autotune.diagnosis.selection.prediction import distinct_starts, extend, predictions, signal_sizes, starting_effects
-from autotune.diagnosis.selection.refits import fit_without, move_time_of_change
 from autotune.diagnosis.selection.scan import search_starts
 from autotune.diagnosis.selection.search import Found, Proposals, search
 from autotune.diagnosis.simulation.assembly import input_size
@@ -123,7 +122,7 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
         def refit(one: JudgedChain) -> JudgedChain | None:
             bench = self.in_units_of(one)
             with suppress(*RUNAWAY):
-                there = fit_from(one.fit.parametrisation, bench.long, one.fit.theta, iterations=LAST_STEPS)
+                there = fit_from(one.fit.parametrisation, bench.long, one.fit.theta, iterations=STEPS)
                 return bench.judged(there, one.log_odds)
             return None
 
@@ -300,5 +299,4 @@ def _fit_added(start: _Start) -> Fit | None:
             result = realign_effects(result, bench.long)
         if not is_stand_in(hypothesis(result), bench.long):
             done.append(result)
-    best = min(done, key=lambda f: f.cost, default=None)
-    return move_time_of_change(best, bench.long) if best is not None and start.kind.is_event else best
+    return min(done, key=lambda f: f.cost, default=None)
