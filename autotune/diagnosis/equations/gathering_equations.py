@@ -66,13 +66,11 @@ def evidence_of_equations(
     law = law_effect(recordings, controller, limits)
     samples += [] if law is None or law.name in without else [law]
 
-    # windows of equations begin with states of their own: what came before a part's readings is not simulated
     return EquationEvidence(
         model=model, given=tuple(recordings), found=found, samples=tuple(samples),
         residual=residual_left(found, samples),
         again=lambda part, more, known: evidence_of_equations(
-            model, [r.only(slice(r.first_reading, None)) for r in part], controller, [*without, *more], quiet, limits,
-            known,
+            model, part, controller, [*without, *more], quiet, limits, known
         ),
     )  # fmt: skip
 

@@ -30,7 +30,7 @@ from autotune.diagnosis.fitting.descent import (
 )
 from autotune.diagnosis.fitting.parameters import Parametrisation
 from autotune.diagnosis.simulation.kernel import SIGNALS
-from autotune.diagnosis.simulation.simulator import Simulator
+from autotune.diagnosis.simulation.simulator import Simulator, Windows
 from autotune.errors import AutotuneError, IdentificationError
 from autotune.models import Model
 
@@ -150,6 +150,29 @@ def start_states(sim: Simulator, data: Data) -> list[FloatArray]:
             y[k] = recording.y[s + int(near.argmax())] if near.any() else float(np.mean(recording.y[good]))
         result.append(sim.rest_states(driving.u[np.maximum(first - 1, 0)], y))
     return result
+
+
+def states_in(result: Fit, data: Data, there: Data) -> list[FloatArray]:
+    """Return the states that a fit's simulation has where other windows begin; rest where it has none.
+
+    Parameters
+    ----------
+    result, data
+        A fit, and what it was fitted to.
+    there : Data
+        Other windows of the same recordings, or of their first rows.
+    """
+    states = start_states(result.sim, there)
+    for i, (x, first) in enumerate(zip(states, there.first_rows, strict=True)):
+        known = data.windows[i]
+        own = np.searchsorted(known.starts, first, side="right") - 1
+        inside = (own >= 0) & (first < known.stops[own])
+        until = Windows(starts=known.starts[own[inside]], stops=first[inside])
+        number, dt = data.numbers[i] if data.numbers else i, data.sample_times[i]
+        x[inside] = result.sim.run(
+            data.driving[i], result.x0[i][own[inside]], until, number=number, sample_time_s=dt, signals=1
+        )[1]
+    return states
 
 
 def states_of(result: Fit, data: Data) -> list[FloatArray]:

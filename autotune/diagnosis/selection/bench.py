@@ -8,12 +8,10 @@ from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Self, TypeVar
 
-import numpy as np
-
 from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.stretches import correlation_rows, held_out_squares, rms
 from autotune.diagnosis.fitting.data import Data, as_white
-from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, fit_from, start_states
+from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, fit_from, states_in
 from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.parameters import Parametrisation
 from autotune.diagnosis.fitting.restarts import realign_effects
@@ -89,7 +87,7 @@ class Bench:
         """Return a fit to long windows that went there from short ones."""
         result: Fit | None = None
         for data, before in zip(self.cuts, (None, *self.cuts), strict=False):
-            x0 = None if result is None or before is None else _carried(result, before, data)
+            x0 = None if result is None or before is None else states_in(result, before, data)
             result = fit(p, data, theta if result is None else result.theta, x0, iterations=STEPS + 3)
         assert result is not None
         return result
@@ -180,15 +178,6 @@ def fit_without(result: Fit, index: int, data: Data) -> Fit | None:
 def residual_sd(result: Fit, data: Data) -> float:
     """Return a residual's standard deviation as of independent rows, at least a millionth of the readings' spread."""
     return max(rms(result.residuals, data.good) * math.sqrt(correlation_rows(result, data)), 1e-6 * spread_of(data))
-
-
-def _carried(result: Fit, before: Data, data: Data) -> tuple[FloatArray, ...]:
-    """Return start states of windows: those of a fit where it had a window there, else rest."""
-    states = start_states(result.sim, data)
-    for full, starts, known, x0 in zip(states, data.first_rows, before.first_rows, result.x0, strict=True):
-        same = np.isin(starts, known)
-        full[same] = x0[np.searchsorted(known, starts[same])]
-    return tuple(states)
 
 
 def at_once(task: Callable[[_T], _R], over: Sequence[_T]) -> list[_R]:

@@ -18,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, fit_from
+from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, states_in
 from autotune.diagnosis.fitting.long_windows import cut, lengths_of
 from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.fitting.restarts import realign_effects
@@ -122,7 +122,8 @@ class _ChainProposals(Bench, Proposals[JudgedChain]):
         def refit(one: JudgedChain) -> JudgedChain | None:
             bench = self.in_units_of(one)
             with suppress(*RUNAWAY):
-                there = fit_from(one.fit.parametrisation, bench.long, one.fit.theta, iterations=STEPS)
+                begun = states_in(one.fit, one.data, bench.long)
+                there = fit(one.fit.parametrisation, bench.long, one.fit.theta, begun, iterations=STEPS)
                 return bench.judged(there, one.log_odds)
             return None
 
