@@ -182,7 +182,7 @@ class EffectLine(LawLine):
         """
         model, memory = self.result.parametrisation.model, self.kind.memory
         effect = self.result.parametrisation.with_values(theta).effects[self.number]
-        values = values_of(effect, self.kind, model)
+        values = values_of(effect, model)
         travel = next((line for line in self.kind.lines if line.stage == "travel"), None)
         from_origin, asks, result = np.asarray(x - self.origin), self.asks, np.empty(x.size)
         name = memory.name if memory is not None else ""

@@ -12,7 +12,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.simulation.assembly import assemble
+from autotune.diagnosis.simulation.assembly import assemble_at, values_of
 from autotune.diagnosis.simulation.simulator import Simulator
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.effects import kind_of
@@ -103,13 +103,30 @@ class Parametrisation:
 
     def simulator(self, theta: FloatArray) -> Simulator:
         """Return the model at a point of the search, assembled."""
-        return assemble(self.with_values(theta))
+        blocks, u_offset, effects = self._at(theta)
+        each = [dict(known) for known in self._values]
+        for (number, key), value in effects.items():
+            each[number][key] = value
+        return assemble_at(self.model, blocks, u_offset, each)
 
     def with_values(self, theta: FloatArray) -> Model:
         """Return the model at a point of the search."""
+        blocks, u_offset, effects = self._at(theta)
+        return replace(
+            self.model,
+            input=replace(self.model.input, offset=u_offset),
+            blocks=blocks,
+            effects=tuple(
+                effect.with_values({key: value for (number, key), value in effects.items() if number == i})
+                for i, effect in enumerate(self.model.effects)
+            ),
+        )
+
+    def _at(self, theta: FloatArray) -> tuple[tuple[Block, ...], float, dict[tuple[int, str], float]]:
+        """Return blocks, the command's operating point, and numbers of effects by effect and name."""
         gain, u_offset, delay = 1.0, self.model.input.offset, None
         factors: list[tuple[tuple[str, int, int], float]] = []
-        effects: dict[tuple[int, int], float] = {}
+        effects: dict[tuple[int, str], float] = {}
         for i, f in enumerate(self.free):
             value = self.value(i, theta)
             if f.kind == "gain":
@@ -119,23 +136,14 @@ class Parametrisation:
             elif f.kind == "delay":
                 delay = max(value, 0.0)
             elif f.kind == "effect":
-                effects[f.index] = value
+                effects[f.index[0], f.name.rpartition(".")[2]] = value
             else:
                 factors.append(((f.kind, *f.index), value))
-        blocks = _scaled(self.model.blocks, gain, tuple(factors), delay)
-        return replace(
-            self.model,
-            input=replace(self.model.input, offset=u_offset),
-            blocks=blocks,
-            effects=_set_effects(self.model.effects, effects),
-        )
+        return _scaled(self.model.blocks, gain, tuple(factors), delay), u_offset, effects
 
-
-def _set_effects(effects: tuple[Effect, ...], values: dict[tuple[int, int], float]) -> tuple[Effect, ...]:
-    return tuple(
-        effect.with_values({k: values[i, j] for j, k in enumerate(effect.parameters) if (i, j) in values})
-        for i, effect in enumerate(effects)
-    )
+    @cached_property
+    def _values(self) -> tuple[dict[str, float], ...]:
+        return tuple(values_of(effect, self.model) for effect in self.model.effects)
 
 
 @lru_cache(maxsize=64)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from autotune.arrays import FloatArray
-from autotune.diagnosis.simulation.chain import blocks_of, build_chain, chain_of
+from autotune.diagnosis.simulation.chain import build_chain, chain_of, with_unit
 from autotune.diagnosis.simulation.simulator import ICE_K, Simulator, layout
 from autotune.effects import KINDS, kind_of
 from autotune.effects.base import EffectKind
 from autotune.errors import InputError
-from autotune.models import Effect, Model
+from autotune.models import Block, Effect, Model
 from autotune.recording import Recording
 
 
@@ -35,18 +35,45 @@ def assemble(model: Model) -> Simulator:
     InputError
         An effect that is not in the catalogue, stands twice, lacks a parameter, or does not fit the chain.
     """
+    return assemble_at(model, model.blocks, model.input.offset, [values_of(effect, model) for effect in model.effects])
+
+
+def assemble_at(
+    model: Model, blocks: tuple[Block, ...], u_offset: float, each: Sequence[Mapping[str, float]]
+) -> Simulator:
+    """Assemble a model for simulation with other numbers; a fit does hundreds of thousands of times.
+
+    Parameters
+    ----------
+    model : Model
+        Its name, ports and effects count, not their values.
+    blocks, u_offset
+        Its blocks, and its operating point [u unit].
+    each : sequence of mapping
+        The effects' parameters, all of them, see :func:`values_of`.
+
+    Returns
+    -------
+    Simulator
+        What runs it.
+
+    Raises
+    ------
+    InputError
+        As :func:`assemble`.
+    """
     known = layout()
     values, acts = np.zeros(len(known.slots)), np.zeros(len(known.kinds), dtype=np.int64)
-    blocks, fall, u_offset = blocks_of(model), None, model.input.offset
+    blocks, fall = with_unit(blocks, model.output.unit), None
     kinds: list[EffectKind] = []
-    for effect in model.effects:
+    for effect, given in zip(model.effects, each, strict=True):
         kind = kind_of(effect.name, model.name)
         if not kind.is_simulated:
             continue
         if kind in kinds:
             raise InputError(f"{kind.name} stands twice", where=model.name, remedy="leave one of the two out")
         kinds.append(kind)
-        given = values_of(effect, kind, model)
+        _require_possible(kind, given, model)
         if kind.lines:
             acts[known.flag(kind.name)] = 1
             for q in kind.parameters:
@@ -76,14 +103,17 @@ def assemble(model: Model) -> Simulator:
     )
 
 
-def values_of(effect: Effect, kind: EffectKind, model: Model) -> dict[str, float]:
-    """Return an effect's parameters, neutral ones where they are not given.
+def values_of(effect: Effect, model: Model) -> dict[str, float]:
+    """Return the parameters of a model's effect, neutral ones where they are not given; none of what is not simulated.
 
     Raises
     ------
     InputError
-        A parameter that it does not have, lacks, or cannot take.
+        A parameter that it does not have, or lacks.
     """
+    kind = kind_of(effect.name, model.name)
+    if not kind.is_simulated:
+        return {}
     known = ", ".join(q.name for q in kind.parameters)
     for key in effect.parameters:
         if kind.quantity(key) is None:
@@ -94,19 +124,24 @@ def values_of(effect: Effect, kind: EffectKind, model: Model) -> dict[str, float
     for q in kind.parameters:
         if q.name in effect.parameters:
             values[q.name] = effect.parameters[q.name].value
-            if q.nonzero and not values[q.name] > 0.0:
-                what = f"{effect.name} has {q.name} = {values[q.name]:g}"
-                raise InputError(what, where=model.name, remedy="give it a value above zero")
         elif q.neutral is None:
             raise InputError(
                 f"{effect.name} lacks {q.name}", where=model.name, remedy=f"add {q.name} to its parameters"
             )
         else:
             values[q.name] = q.neutral
+    return values
+
+
+def _require_possible(kind: EffectKind, values: Mapping[str, float], model: Model) -> None:
+    """Refuse values that an effect cannot take."""
+    for q in kind.parameters:
+        if q.nonzero and not values[q.name] > 0.0:
+            what = f"{kind.name} has {q.name} = {values[q.name]:g}"
+            raise InputError(what, where=model.name, remedy="give it a value above zero")
     wrong = kind.possible(values, model) if kind.possible is not None else ""
     if wrong:
-        raise InputError(wrong, where=model.name, remedy=f"leave {effect.name} out")
-    return values
+        raise InputError(wrong, where=model.name, remedy=f"leave {kind.name} out")
 
 
 def states_that_stay(name: str, order: int) -> slice:

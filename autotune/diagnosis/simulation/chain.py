@@ -133,15 +133,13 @@ def _realise_first_order(dynamics: TransferFunction) -> tuple[FloatArray, FloatA
 
 def build_chain(model: Model) -> Chain:
     """Arrange a model's blocks in state space, see :func:`chain_of`; its effects are not looked at."""
-    return chain_of(blocks_of(model), model.name)
+    return chain_of(with_unit(model.blocks, model.output.unit), model.name)
 
 
-def blocks_of(model: Model) -> tuple[Block, ...]:
-    """Return a model's blocks, the last one with the unit of the measurement where it has none of its own."""
-    last = model.blocks[-1]
-    if last.unit or last.output or not model.output.unit:
-        return model.blocks
-    return (*model.blocks[:-1], replace(last, unit=model.output.unit))
+def with_unit(blocks: tuple[Block, ...], unit: str) -> tuple[Block, ...]:
+    """Return blocks, the last one with the unit of the measurement where it has none of its own."""
+    last = blocks[-1]
+    return blocks if last.unit or last.output or not unit else (*blocks[:-1], replace(last, unit=unit))
 
 
 @lru_cache(maxsize=64)

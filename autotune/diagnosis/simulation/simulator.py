@@ -132,11 +132,10 @@ class Simulator:
             pieces = max(pieces, math.ceil(self.chain.fastest_of_plant * dt_s / FASTEST))
         return dt_s / min(pieces, MOST_PIECES)
 
-    @cached_property
+    @property
     def pieces(self) -> tuple[int, bool]:
         """Sub-steps of a sample at least, whatever its length, and whether forces ask for more."""
-        least = max(_LINEAR if self.linear_hold else 1, *(kind.sub_steps for kind in self.kinds), 1)
-        return least, any(_acts_at(kind, *_FORCED) for kind in self.kinds)
+        return _pieces(self.kinds, self.linear_hold)
 
     def run(
         self,
@@ -176,7 +175,7 @@ class Simulator:
         chain, (rows, count) = self.chain, _rows(windows, len(recording))
         states = np.empty((2, rows.shape[1], chain.order))
         states[0] = x0
-        numbers, flags = self.numbers.copy(), self.flags.copy()
+        numbers, flags = self.numbers.copy(), self.flags
         numbers[kernel.STEP] = step
         flags[kernel.NUMBER], flags[kernel.SIGNALS_ASKED], flags[kernel.ROWS] = number, signals, count
         out = self.compiled(
@@ -190,23 +189,12 @@ class Simulator:
         place = (0.0, self.chain.delay_s, self.u_offset, self.y_offset, self.kelvin, float(self.chain.is_static))
         return np.concatenate([place, self.chain.gains, self.values])
 
-    @cached_property
+    @property
     def flags(self) -> IntArray:
         """What it may leave out, see the positions in its body; each run fills in number, signals and rows."""
-        directional = self.falling is not self.chain
-        forced = any(_acts_at(kind, *_FORCED) for kind in self.kinds)
-        driven = any(_acts_at(kind, "converter", "command", "stop") for kind in self.kinds)
-        others = tuple(name for name in _FORCED if name != "friction")
-        rubbed = forced and self.order == 2 and not any(_acts_at(kind, *others) for kind in self.kinds)
-        told = (
-            0, 0, int(self.linear_hold), int(directional), *self.chain.where, int(forced),
-            *(int(any(_acts_at(kind, stage) for kind in self.kinds)) for stage in _TOLD),
-            int(any(_acts_at(kind, "sensor", "reading") for kind in self.kinds)),
-            int(not (forced or driven or directional or self.linear_hold)),
-            int(rubbed and not (driven or directional or self.linear_hold)),
-            int(any(kind.memory is not None and kind.memory.replayed for kind in self.kinds)), 0,
-        )  # fmt: skip
-        return np.concatenate([np.array(told, dtype=np.int64), self.acts])
+        where: tuple[int, ...] = tuple(self.chain.where.tolist())
+        told = _told(self.kinds, self.linear_hold, self.falling is not self.chain, self.order, where)
+        return np.concatenate([told, self.acts])
 
     def rest_state(self, u: float, y: float) -> FloatArray:
         """Return the state nearest to rest under a command that gives a reading.
@@ -301,6 +289,32 @@ _TOLD: tuple[StageName, ...] = ("force", "friction", "outflow", "stop")
 
 def _acts_at(kind: EffectKind, *names: StageName) -> bool:
     return not kind.stages.isdisjoint(names)
+
+
+@lru_cache(maxsize=256)
+def _pieces(kinds: tuple[EffectKind, ...], linear_hold: bool) -> tuple[int, bool]:
+    least = max(_LINEAR if linear_hold else 1, *(kind.sub_steps for kind in kinds), 1)
+    return least, any(_acts_at(kind, *_FORCED) for kind in kinds)
+
+
+@lru_cache(maxsize=256)
+def _told(
+    kinds: tuple[EffectKind, ...], linear_hold: bool, directional: bool, order: int, where: tuple[int, ...]
+) -> IntArray:
+    """Return the flags of a chain of an order with effects; ``where`` are its states that the body asks for."""
+    forced = any(_acts_at(kind, *_FORCED) for kind in kinds)
+    driven = any(_acts_at(kind, "converter", "command", "stop") for kind in kinds)
+    others = tuple(name for name in _FORCED if name != "friction")
+    rubbed = forced and order == 2 and not any(_acts_at(kind, *others) for kind in kinds)
+    told = (
+        0, 0, int(linear_hold), int(directional), *where, int(forced),
+        *(int(any(_acts_at(kind, stage) for kind in kinds)) for stage in _TOLD),
+        int(any(_acts_at(kind, "sensor", "reading") for kind in kinds)),
+        int(not (forced or driven or directional or linear_hold)),
+        int(rubbed and not (driven or directional or linear_hold)),
+        int(any(kind.memory is not None and kind.memory.replayed for kind in kinds)), 0,
+    )  # fmt: skip
+    return np.array(told, dtype=np.int64)
 
 
 @cache
