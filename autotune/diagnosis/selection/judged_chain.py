@@ -15,7 +15,7 @@ from autotune.diagnosis.evidence.constancy import largest_variation
 from autotune.diagnosis.evidence.held_out import FitQuality
 from autotune.diagnosis.evidence.stretches import error_beside_still, judged_rows, rms
 from autotune.diagnosis.fitting.data import Data
-from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, fit_from, residual_at
+from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, residual_at, states_in
 from autotune.diagnosis.fitting.levels import sweep
 from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.retuning import reduced_chi2, under_noise
@@ -134,12 +134,15 @@ def at_both_scales(one: JudgedChain, found: Sequence[JudgedChain]) -> JudgedChai
         return one
     p, held = one.fit.parametrisation, np.zeros(one.fit.theta.size, dtype=bool)
     both = one.data.beside(one.few)
-    thetas = (theta for j in found if j.names == one.names for theta in (j.fit.theta, j.short.theta))
+    known = [pair for j in found if j.names == one.names for pair in ((j.fit, j.data), (j.short, j.few))]
     try:
-        start = min((fit(p, both, theta, free=held, iterations=STEPS) for theta in thetas), key=lambda f: f.cost)
+        begun = (
+            (f.theta, [x for there in (one.data, one.few) for x in states_in(f, data, there)]) for f, data in known
+        )
+        start = min((fit(p, both, *at, free=held, iterations=STEPS) for at in begun), key=lambda f: f.cost)
         joint = _least_over_levels(fit(p, both, start.theta, start.x0, iterations=STEPS), both)
         joint = fit(p, both, joint.theta, joint.x0, iterations=LAST_STEPS)
-        far = fit_from(p, one.data, joint.theta, iterations=0, rounds=0)  # with the derivatives of all numbers
+        far = fit(p, one.data, joint.theta, joint.x0[: len(one.data.starts)], rounds=0)
     except RUNAWAY:
         return one
     return replace(one, fit=replace(far, covariance=joint.covariance))
