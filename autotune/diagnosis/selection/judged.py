@@ -250,9 +250,9 @@ def predicts_best(base: _J, found: Sequence[_J], parts: Sequence[Mapping[frozens
     Returns
     -------
     Judged
-        The one with the least mean logarithm of the errors on all rows and on the parts: no larger one on any of them,
-        and the mean less by a share that is material. The given one where there is none, where no part tells, and where
-        what it leaves is noise. What came from the surroundings, or at a time, is not in another recording.
+        The one with the least mean logarithm of the errors on all rows and on the parts, of those that err less on each
+        of them, by a share that is material. The given one where there is none, where no part tells, and where what it
+        leaves is noise. What came from the surroundings, or at a time, is not in another recording.
     """
     leading = each_best(found)
     sets = [errors_of(leading), *parts]
@@ -265,14 +265,11 @@ def predicts_best(base: _J, found: Sequence[_J], parts: Sequence[Mapping[frozens
     def is_able(one: Judged) -> bool:
         further = [kind_of(name) for name in {*one.names} - {*base.names}]
         lasts = all(kind.place != "environment" and not kind.at_a_time for kind in further)
-        return (
-            base.identity < one.identity
-            and lasts
-            and all(told.get(one.identity, math.inf) < told[base.identity] for told in sets)
-        )
+        gains = (told[base.identity] - told.get(one.identity, math.inf) for told in sets)
+        return base.identity < one.identity and lasts and all(0.5 * gain > least for gain in gains)
 
-    best = min(filter(is_able, leading), key=mean, default=base)
-    return best if 0.5 * (mean(best) - mean(base)) < math.log(1.0 - base.limits.material) else base
+    least = -math.log(1.0 - base.limits.material)
+    return min(filter(is_able, leading), key=mean, default=base)
 
 
 def probabilities(found: Sequence[_J], best: _J, unknown_odds: float) -> tuple[Candidate, ...]:
