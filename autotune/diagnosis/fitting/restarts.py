@@ -20,7 +20,7 @@ from autotune.effects.stages import Values
 #: Decrease of the cost for which an effect is moved: of chi-square, or as a share of it where model error and not noise
 #: is its unit.
 LEAST_GAIN, LEAST_SHARE = 1.0, 0.02
-#: How often start states are found anew at most.
+#: How often start states are found anew, or an effect is moved and all fitted again, at most.
 RENEWALS = 3
 
 
@@ -71,23 +71,32 @@ def realign_effects(result: Fit, data: Data) -> Fit:
     number = next((i for i in reversed(range(len(effects))) if kind_of(effects[i].name).moves is not None), -1)
     if number < 0:
         return result
-    kind = kind_of(effects[number].name)
+    for _ in range(RENEWALS):
+        best = _nearest_around(result, data, number)
+        if best.values == result.model.effects[number].values:
+            break
+        again = fit(best.parametrisation, data, best.theta, result.x0, iterations=STEPS, inherit=result)
+        if again.cost > result.cost - min(LEAST_GAIN, LEAST_SHARE * result.cost):
+            break
+        result = again
+    return result
+
+
+def _nearest_around(result: Fit, data: Data, number: int) -> _Moved:
+    """Return what leaves least of an effect's values: those of a fit, or others around them, ever nearer."""
+    kind = kind_of(result.model.effects[number].name)
     extent = Extent(
         span=max(float(np.ptp(r.u)) for r in data.driving),
         duration_s=max(r.duration_s for r in data.driving),
         dt_s=max(data.sample_times),
     )
-    before = best = _moved(result, data, kind, number, result.model.effects[number].values)
+    best = _moved(result, data, kind, number, result.model.effects[number].values)
     share, able = 1.0, True
     while able:
         tried = kind.moves(best.values, extent, share) if kind.moves is not None else []
         best = min((best, *(_moved(result, data, kind, number, there) for there in tried)), key=lambda one: one.cost)
         share, able = 0.5 * share, bool(tried)
-    if best is before:
-        return result
-    again = fit(best.parametrisation, data, best.theta, result.x0, iterations=STEPS, inherit=result)
-    better = again.cost < result.cost - min(LEAST_GAIN, LEAST_SHARE * result.cost)
-    return realign_effects(again, data) if better else result
+    return best
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
