@@ -134,7 +134,7 @@ def _in_order(
     agreed = evidence.keeping(likely(said))
     # what no part agrees on was found all the same, and may be what follows y whatever the command does
     explains = agreed if judged(agreed) == "effect" else alone
-    if judged(agreed) != "unexplained" and (unheeded := explains.unheeded_commands()):
+    if unheeded := explains.unheeded_commands():
         return _diagnosis(agreed.keeping(()), unheeded)
     named = _names(agreed, said)
     nearer = agreed.predicting([errors for _, errors in there]) if named else agreed
