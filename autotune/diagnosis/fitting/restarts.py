@@ -75,7 +75,10 @@ def realign_effects(result: Fit, data: Data) -> Fit:
         best = _nearest_around(result, data, number)
         if best.values == result.model.effects[number].values:
             break
-        again = fit(best.parametrisation, data, best.theta, result.x0, iterations=STEPS, inherit=result)
+        try:
+            again = fit(best.parametrisation, data, best.theta, result.x0, iterations=STEPS, inherit=result)
+        except RUNAWAY:
+            break
         if again.cost > result.cost - min(LEAST_GAIN, LEAST_SHARE * result.cost):
             break
         result = again
@@ -91,11 +94,10 @@ def _nearest_around(result: Fit, data: Data, number: int) -> _Moved:
         dt_s=max(data.sample_times),
     )
     best = _moved(result, data, kind, number, result.model.effects[number].values)
-    share, able = 1.0, True
-    while able:
-        tried = kind.moves(best.values, extent, share) if kind.moves is not None else []
+    share = 1.0
+    while tried := kind.moves(best.values, extent, share) if kind.moves is not None else []:
         best = min((best, *(_moved(result, data, kind, number, there) for there in tried)), key=lambda one: one.cost)
-        share, able = 0.5 * share, bool(tried)
+        share *= 0.5
     return best
 
 
