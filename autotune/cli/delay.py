@@ -110,5 +110,6 @@ def describe(model: DelayModel) -> str:
     parts = [f"delay {model.delay_s:.4g} +- {1.96 * sd[n + 1]:.2g} s"]
     parts += [f"a{i} {value:.4g} +- {1.96 * sd[i]:.2g}" for i, value in enumerate(model.a)]
     parts.append(f"b {model.b:.4g} +- {1.96 * sd[n]:.2g}")
-    colour = f"coloured (order {len(model.noise_ar)})" if model.noise_ar else "white"
+    order = model.whitening.lost
+    colour = (f"coloured (order {order})" if order else "white") + (" with a load's" if model.noise_ma else "")
     return f"{', '.join(parts)} (95 %), noise {colour}, sd {model.noise_sd:.3g}"

@@ -125,7 +125,7 @@ def checks(
     controller: PIDController,
     specification: Specification,
     *,
-    probability: float | None,
+    region: bool,
 ) -> tuple[Check, ...]:
     """Return the checks of a controller on the fitted plant, the points, and the region of the fit, in this order.
 
@@ -139,16 +139,17 @@ def checks(
         Of any kind, from any source.
     specification : Specification
         What was asked for.
-    probability : float or None
-        Of the fit's region; None for a design on the points, which bounds a wider class than the fit's structure.
+    region : bool
+        Whether the fit's region counts; it does not for a design on the points, which bounds a wider class.
     """
     found = [on_plants((fit.plant,), controller, specification, "the fitted plant")]
     if points:
         found.append(on_points(points, controller, specification))
-    if probability is None:
+    if not region:
         return tuple(found)
-    region = f"the {100 * probability:g} % region of the fitted plant"
+    distance = specification.distance
+    border = worst_of(fit.border(distance), controller, specification)
     found.append(
-        on_plants(worst_of(fit.border(probability), controller, specification), controller, specification, region)
+        on_plants(border, controller, specification, f"plants {distance:.2f} standard deviations from the fitted one")
     )
     return tuple(found)

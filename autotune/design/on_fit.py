@@ -1,9 +1,9 @@
 """Synthesis on a fitted plant and its region: margins for every plant on the border of what the data leave possible.
 
-The parameters of a fit are known to a joint region, and other structures may not be excluded by the data. The
-controller minimises the norm on the estimate while the plants on the border of those regions keep the margins too. It
-is visited in many directions, but only the few plants that bind become constraints (a cutting-plane method: what is
-violated is added until nothing is).
+The parameters of a fit are known to so many standard deviations, and other structures may not be excluded by the data.
+The controller minimises the norm on the estimate while the plants as far off as the margins need keep them too (see
+:attr:`autotune.design.specification.Specification.distance`). That border is visited in many directions, but only the
+few plants that bind become constraints (a cutting-plane method: what is violated is added until nothing is).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def design_on_fit(fit: PlantFit, specification: Specification, kind: Kind = "pi"
             where="fitted plant",
             remedy="record the plant under steps of the command, which shows resonances, or design on a model of it",
         )
-    border = members_of(fit.border(PROBABILITY), specification)
+    border = members_of(fit.border(specification.distance), specification)
     found, slack = design_on_plants(fit.plant, border, specification, kind)
     if np.min(slack) < -2.0 * TOLERANCE:
         raise DesignError(
@@ -73,8 +73,8 @@ def design_on_fit(fit: PlantFit, specification: Specification, kind: Kind = "pi"
         )
     return replace(
         found,
-        certificate=f"margins hold on the border of the {100 * PROBABILITY:g} % region of the fitted plant; no lower "
-        "bound on the norm",
+        certificate=f"margins hold for the plants within {specification.distance:.2f} standard deviations of the "
+        f"fitted one: the rig keeps all of them with {100 * PROBABILITY:g} %; no lower bound on the norm",
     )
 
 

@@ -12,6 +12,7 @@ from autotune.arrays import FloatArray
 from autotune.controller import PIDController
 from autotune.design.figures import CONSTRAINTS, Figures, require_frequency
 from autotune.design.margins import Margins
+from autotune.distributions import chi2_quantile
 from autotune.errors import DesignError
 from autotune.models import LARGEST, SMALLEST
 
@@ -20,7 +21,7 @@ Kind: TypeAlias = Literal["pi", "pid"]
 _EQUAL = {"h2": 1e-4, "iae": 3e-3}
 #: what a certificate says of margins that need not hold on every plant that the measurements allow
 UNCERTAIN = "not certain:"
-#: of the joint region of points, or of a fit's parameters, on which margins are kept
+#: of the joint region of points on which margins are kept, and that a rig keeps all that were kept about its fit
 PROBABILITY = 0.95
 #: a margin as small as this asks for nothing, and its reciprocal is no gain
 _LEAST = 1e-9
@@ -89,6 +90,16 @@ class Specification:
     def largest_gain(self) -> float:
         """Largest abs(K) of a PI on a strictly proper plant: M_m N_max by (16), N_max by (15), as L ends at 0."""
         return self.modulus_margin * self.noise_gain if self.noise == "bound" else self.noise_gain
+
+    @property
+    def distance(self) -> float:
+        """How many standard deviations from a fit plants keep each margin asked for, so that the rig keeps all of them.
+
+        Near the fit a margin is linear in its parameters, however many: the rig misses one with the probability of a
+        normal distribution's tail (Hasofer and Lind 1974), and any of them at most with the sum (Bonferroni).
+        """
+        asked = 3 if self.delay_margin_s > 0.0 else 2
+        return math.sqrt(chi2_quantile(1.0 - 2.0 * (1.0 - PROBABILITY) / asked, 1))
 
     def slacks(self, figures: Figures) -> FloatArray:
         """Return (..., 4) relative slacks in the order of CONSTRAINTS: negative where violated, infinite if not asked.

@@ -1,9 +1,13 @@
-"""Colour of the noise behind a fit's residual: autoregressive, by restricted likelihood, with what its estimate costs.
+"""Colour of the noise behind a fit's residual, by restricted likelihood: a load's and an autoregression's.
 
 A fit takes noise along, most of it where its own sensitivities lie, which for a plant is near frequency zero. A colour
 that is read off the residual alone lacks that noise, and intervals that rest on it are too narrow. The restricted
 likelihood is that of what the fit leaves, whatever the parameters are: the residual's products plus what the fit took.
 What an estimated colour leaves open beyond that is counted in degrees of freedom.
+
+A plant's output also wanders with its load, far more slowly than a sensor's noise, and few rows show it: an
+autoregression that a criterion chooses from the residual leaves it out. It comes in where the command does, through the
+plant's own lags, so that one variance says what it does at all frequencies: see :func:`load_filters`.
 
 References
 ----------
@@ -16,7 +20,8 @@ Giesbrecht, Burns, Two-stage analysis based on a mixed model, Biometrics 41, 198
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -24,11 +29,12 @@ from numba import njit
 from scipy.optimize import minimize
 from scipy.special import fdtri, ndtri, stdtrit
 
-from autotune.arrays import FloatArray
+from autotune.arrays import ComplexArray, FloatArray
 from autotune.distributions import chi2_quantile
 
-WHITE = np.empty(0)
 MAX_AR = 12
+#: What a load adds to the density of the other noise at its own corner frequency, from hardly anything to all.
+_LOADS = np.geomspace(0.03, 1000.0, 19)
 #: Step of a difference quotient in a parameter, which is known to some 1/sqrt(rows).
 _DIFFERENCE = 1e-3
 #: Share of products below which they are rounding, as those of exact data are.
@@ -42,27 +48,56 @@ _STATIONARY = 0.9999
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class NoiseColour:
-    """Autoregressive noise (1 + c_1 q^-1 + ..) w = innovation.
+class Whitening:
+    """The filter (1 + c_1 q^-1 + ..)/(1 + d_1 q^-1 + ..), q^-1 the previous row, that makes a noise white.
 
     Attributes
     ----------
-    whitening : (p,) array
-        c_1..c_p; empty where the noise is white.
+    ar : (p,) array
+        c_1..c_p: of the autoregression, and of the load that d goes with.
+    ma : (r,) array
+        d_1..d_r, r at most p; empty where no load was found.
+    """
+
+    ar: FloatArray = field(default_factory=lambda: np.empty(0))
+    ma: FloatArray = field(default_factory=lambda: np.empty(0))
+
+    @property
+    def lost(self) -> int:
+        """Rows at the beginning that are dropped: an autoregression knows no past; a load begins at the first row."""
+        return self.ar.size - self.ma.size
+
+    def filtered(self, signals: FloatArray) -> FloatArray:
+        """Return signals (N, S) filtered as if nothing had been before them, (N, S)."""
+        return np.asarray(_filtered(np.ascontiguousarray(signals), self.ar, self.ma))
+
+
+WHITE = Whitening()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class NoiseColour:
+    """Noise that a filter makes white.
+
+    Attributes
+    ----------
+    whitening : Whitening
+        The filter.
     variance : float
         Of the innovation.
     freedom : (P,) array
         Degrees of freedom of the variance of each parameter of the fit.
     """
 
-    whitening: FloatArray
+    whitening: Whitening
     variance: float
     freedom: FloatArray
 
     def variance_at(self, omega: FloatArray) -> FloatArray:
         """Return the variance of white noise with the same spectral density at frequencies (F,) [rad/row]."""
-        transfer = np.polyval([*self.whitening[::-1], 1.0], np.exp(-1j * omega))
-        return np.asarray(self.variance / np.abs(transfer) ** 2, dtype=np.float64)
+        back = np.exp(-1j * omega)
+        ar, ma = (np.polyval([*one[::-1], 1.0], back) for one in (self.whitening.ar, self.whitening.ma))
+        return np.asarray(self.variance * np.abs(ma / ar) ** 2, dtype=np.float64)
 
     def widening(self) -> FloatArray:
         """Return, for each parameter, by how much 1.96 standard deviations fall short of Student's 95 % interval."""
@@ -97,8 +132,8 @@ def whitening_filter(residual: FloatArray, max_order: int = MAX_AR) -> FloatArra
     N = residual.size
     max_order = min(max_order, N // 20)
     r = _autocovariances(residual, max_order)
-    best, filter_best = N * np.log(r[0]), WHITE
-    c, variance = WHITE, float(r[0])
+    best, filter_best = N * np.log(r[0]), np.empty(0)
+    c, variance = np.empty(0), float(r[0])
     for order, product in enumerate(np.asarray_chkfinite(r[1:]), 1):  # each order from the last (Levinson, Durbin)
         partial = -(product + c @ r[order - 1 : 0 : -1]) / variance
         c = np.append(c + partial * c[::-1], partial)
@@ -123,7 +158,83 @@ def _autocovariances(values: FloatArray, lags: int) -> FloatArray:
     return result
 
 
-def noise_colour(columns: FloatArray, residual: FloatArray, max_order: int = MAX_AR) -> NoiseColour:
+@njit(cache=True, nogil=True)
+def _filtered(signals: FloatArray, ar: FloatArray, ma: FloatArray) -> FloatArray:
+    white = np.empty_like(signals)
+    for k in range(signals.shape[0]):
+        for c in range(signals.shape[1]):
+            total = signals[k, c]
+            for i in range(min(k, ar.size)):
+                total += ar[i] * signals[k - 1 - i, c]
+            for i in range(min(k, ma.size)):
+                total -= ma[i] * white[k - 1 - i, c]
+            white[k, c] = total
+    return white
+
+
+def load_filters(poles: ComplexArray, corner: float) -> list[Whitening]:
+    """Return the filters that whiten white noise with a load of several sizes, none first.
+
+    Parameters
+    ----------
+    poles : (r,) array
+        From one row to the next of what the load is on its way to y: its own and the plant's.
+    corner : float
+        Frequency [rad/row] at which it is held against the white noise.
+
+    Notes
+    -----
+    With w = 2 - z - 1/z each pole p has (1 - p/z)(1 - p z) = (1 - p)^2 + p w. The noise's spectrum is that of the
+    poles' product, and the ratio of variances more, over that product: its zeros come from the roots in w, which keep
+    the digits that those in z lose beside 1. Zeros of the load's own way do not count.
+    """
+    squares = (1.0 - poles) ** 2
+    unit = corner**2
+    product = np.array([1.0 + 0.0j])  # ascending powers of w over the unit
+    for square, pole in zip(squares, poles, strict=True):
+        product = np.convolve(product, np.array([square / unit, pole]))
+    at_corner = float(np.abs(np.polyval(product[::-1], 2.0 * (1.0 - math.cos(corner)) / unit)))
+    ar = np.real(np.poly(poles))[1:]
+    found = [WHITE]
+    for ratio in _LOADS:
+        w = unit * np.roots((product + ratio * at_corner * (np.arange(product.size) == 0))[::-1])
+        root = np.sqrt(-0.5 * w * (2.0 - 0.5 * w))
+        zeros = 1.0 - 0.5 * w - np.where(np.abs(1.0 - 0.5 * w - root) < 1.0, root, -root)
+        found.append(Whitening(ar=ar, ma=np.real(np.poly(zeros))[1:]))
+    return found
+
+
+def _likeliest(
+    columns: FloatArray, residual: FloatArray, loads: Sequence[Whitening], max_order: int
+) -> tuple[Whitening, FloatArray]:
+    """Return the load's filter of the largest restricted likelihood, and the autoregression of what it leaves.
+
+    A load has no threshold to pass: its variance is estimated, as that of any noise is, and may be none.
+    """
+    signals = np.column_stack([columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), residual])
+    order = min(max_order, residual.size // 20)
+    best: tuple[float, Whitening, FloatArray] = (math.inf, WHITE, np.empty(0))
+    for load in loads:
+        of_load = load.filtered(signals)
+        if not np.all(np.isfinite(of_load)):
+            continue
+        ar = whitening_filter(of_load[:, -1], max_order)
+        white = Whitening(ar=ar).filtered(of_load)[order:]
+        gram = white.T @ white
+        of_columns, across = gram[:-1, :-1], gram[:-1, -1]
+        of_columns[np.diag_indices_from(of_columns)] += _EXACT * np.trace(of_columns)
+        left = max(float(gram[-1, -1] - across @ np.linalg.solve(of_columns, across)), _EXACT * float(gram[-1, -1]))
+        rows = len(white)
+        cost = (rows - len(of_columns)) * math.log(max(left, 1e-300)) + float(np.linalg.slogdet(of_columns)[1])
+        cost += ar.size * math.log(rows)
+        if cost < best[0]:
+            best = cost, load, ar
+    return best[1], best[2]
+
+
+def noise_colour(
+    columns: FloatArray, residual: FloatArray, max_order: int = MAX_AR, loads: Sequence[Whitening] = (WHITE,)
+) -> NoiseColour:
     """Return the colour of the noise behind a least-squares fit.
 
     Parameters
@@ -133,21 +244,27 @@ def noise_colour(columns: FloatArray, residual: FloatArray, max_order: int = MAX
     residual : (N,) array
         What it left.
     max_order : int
-        Largest order tried; 0 for noise that is known to be white.
+        Largest order of the autoregression that is tried; 0 where there is none.
+    loads : sequence of Whitening
+        Filters for loads, of which one is taken, and the autoregression is that of what it leaves.
 
     Returns
     -------
     NoiseColour
         Of the order that the residual asks for.
     """
-    start = whitening_filter(residual, max_order)
+    load, start = WHITE, whitening_filter(residual, max_order)
+    if len(loads) > 1:
+        load, start = _likeliest(columns, residual, loads, max_order)
+        columns, residual = load.filtered(columns), load.filtered(residual[:, None])[:, 0]
     likelihood = _Restricted.of(columns, residual, start.size)
     partial = likelihood.parameters(_partial_correlations(start))
     if start.size:
         scale = np.diag(likelihood.variances(partial))
         partial = minimize(likelihood.cost_and_slope, partial, jac=True, method="BFGS", options={"hess_inv0": scale}).x
+    ar = _filter_and_slopes(likelihood.correlations(partial))[0]
     return NoiseColour(
-        whitening=_filter_and_slopes(likelihood.correlations(partial))[0][1:],
+        whitening=Whitening(ar=np.convolve(ar, [1.0, *load.ar])[1:], ma=load.ma),
         variance=likelihood.variance(partial) * float(residual @ residual),
         freedom=likelihood.freedom(partial),
     )

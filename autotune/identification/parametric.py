@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, least_squares
 
 from autotune.arrays import ComplexArray, FloatArray, principal_axes
-from autotune.distributions import chi2_quantile, chi2_tail
+from autotune.distributions import chi2_tail
 from autotune.errors import IdentificationError
 from autotune.models import TransferFunction
 from autotune.points import FrequencyPoint
@@ -120,13 +120,14 @@ class PlantFit:
         )
         return np.asarray(np.maximum(self.parameters + min(max(share, 0.0), 1.0) * step, lower), dtype=np.float64)
 
-    def border(self, probability: float) -> tuple[TransferFunction, ...]:
-        """Return plants on the border of the joint region of all parameters, and of the other structures' likewise.
+    def border(self, distance: float) -> tuple[TransferFunction, ...]:
+        """Return plants so far from the estimate, and from that of the other structures likewise.
 
         Parameters
         ----------
-        probability : float
-            Of each structure's region, to first order.
+        distance : float
+            In standard deviations (Mahalanobis), which is that of the nearest plant at which something happens that is
+            linear in the parameters.
 
         Notes
         -----
@@ -135,14 +136,13 @@ class PlantFit:
         """
         if not self.covariance.any():
             return (self.plant,)
-        radius = math.sqrt(chi2_quantile(probability, self.parameters.size))
         axes = principal_axes(self.covariance)
         between = np.random.default_rng(0).standard_normal((_DIRECTIONS, self.parameters.size))
         between /= np.linalg.norm(between, axis=1, keepdims=True)
         directions = np.vstack((np.eye(self.parameters.size), -np.eye(self.parameters.size), between, -between))
-        samples = self.parameters + radius * directions @ axes.T
+        samples = self.parameters + distance * directions @ axes.T
         members = [self.build(self._within(sample)) for sample in samples]
-        return (*members, *(plant for fit in self.others for plant in (fit.plant, *fit.border(probability))))
+        return (*members, *(plant for fit in self.others for plant in (fit.plant, *fit.border(distance))))
 
 
 def fit_plant(points: Sequence[FrequencyPoint]) -> PlantFit:

@@ -15,6 +15,7 @@ from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.output_error import Point, Structure, minimise, solve_linear
 from autotune.identification.delay.output_error_model import inverse_information
 from autotune.identification.equation_region import Equation
+from autotune.identification.noise_colour import Whitening
 from autotune.points import FrequencyPoint
 
 _ORDERS, _ZEROS = (1, 2, 3, 4), (0, 1)
@@ -117,7 +118,7 @@ def fit_from_points(points: Sequence[FrequencyPoint], data: DelayData, largest: 
         places = [(a, h) for _, a, h in through[:_TRIED]]
         places += [place for one in found for place in _grow_places(one, structure, omega)]
         begun = min((solve_linear(data, structure, *place) for place in places), key=lambda point: point.cost)
-        found += _fit_structure(data, structure, begun, len(places), largest, np.empty(0))
+        found += _fit_structure(data, structure, begun, len(places), largest, Whitening())
     return _drop_undetermined(found, data)
 
 
@@ -156,7 +157,7 @@ def _through(omega: FloatArray, G: ComplexArray, structure: Structure, h: float)
     return float(np.sum(np.abs(missed) ** 2)), tuple(a.tolist())
 
 
-def fit_again(data: DelayData, found: Sequence[Fitted], largest: float, whitening: FloatArray) -> list[Fitted]:
+def fit_again(data: DelayData, found: Sequence[Fitted], largest: float, whitening: Whitening) -> list[Fitted]:
     """Return structures at their minima under noise of another colour.
 
     Parameters
@@ -167,8 +168,8 @@ def fit_again(data: DelayData, found: Sequence[Fitted], largest: float, whitenin
         Where each begins.
     largest : float
         Longest delay [s].
-    whitening : (p,) array
-        Coefficients of the filter that makes the noise white.
+    whitening : Whitening
+        Makes the noise white.
 
     Raises
     ------
@@ -189,7 +190,7 @@ def _drop_undetermined(found: list[Fitted], data: DelayData) -> list[Fitted]:
 
 
 def _fit_structure(
-    data: DelayData, structure: Structure, begun: Point, places: int, largest: float, whitening: FloatArray
+    data: DelayData, structure: Structure, begun: Point, places: int, largest: float, whitening: Whitening
 ) -> list[Fitted]:
     """Return a structure at its minimum; nothing where the rows do not determine it."""
     if not math.isfinite(begun.cost):
@@ -199,7 +200,7 @@ def _fit_structure(
     return [] if covariance is None else [Fitted(structure=structure, point=at, covariance=covariance, places=places)]
 
 
-def _lowest(data: DelayData, structure: Structure, start: Point, largest: float, whitening: FloatArray) -> Point:
+def _lowest(data: DelayData, structure: Structure, start: Point, largest: float, whitening: Whitening) -> Point:
     """Return the lowest minimum around a start: over h there is one beyond each row that a step of u passes."""
     best = minimise(data, structure, start, max_delay_s=largest, whitening=whitening, iterations=_ITERATIONS)
     step_s = float(np.median(np.diff(data.tu)))
@@ -219,7 +220,7 @@ def _lowest(data: DelayData, structure: Structure, start: Point, largest: float,
     return best
 
 
-def _covariance(data: DelayData, structure: Structure, at: Point, whitening: FloatArray) -> FloatArray | None:
+def _covariance(data: DelayData, structure: Structure, at: Point, whitening: Whitening) -> FloatArray | None:
     """Return the covariance of a_0.., b_0.., h at a minimum; None where the rows do not determine them."""
     inverse = inverse_information(data, structure, at, whitening)
     if inverse is None:

@@ -28,6 +28,7 @@ from autotune.identification.delay.data import prepare
 from autotune.identification.envelope import polar_sd
 from autotune.identification.equation_region import plant_fit
 from autotune.identification.frequency.limit_cycle import WholePeriods
+from autotune.identification.noise_colour import Whitening
 from autotune.identification.parametric import PlantFit
 from autotune.identification.sweep_adequacy import TESTS, colour_beside, judge_equation, own_columns
 from autotune.identification.sweep_equations import Fitted, as_parts, fit_again, fit_from_points
@@ -122,7 +123,7 @@ def estimate_sweep(
     columns, kinds = own_columns(data.ty, [window for _, window in cycles])
     white = fit_from_points([point for point, _ in cycles], data, largest)
     whitening = colour_beside(data, min(white, key=lambda one: one.criterion), columns)
-    found = fit_again(data, white, largest, whitening) if whitening.size else white
+    found = fit_again(data, white, largest, Whitening(ar=whitening)) if whitening.size else white
     best = min(found, key=lambda one: one.criterion)
     p_values, excess = judge_equation(data, best, columns, kinds, whitening)
     omega = _frequencies(best, omega_rad_s, phases_rad)

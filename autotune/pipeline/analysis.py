@@ -20,7 +20,7 @@ from autotune.design.on_reduced import design_on_reduced
 from autotune.design.plausibility import implausible
 from autotune.design.process_class import consistent_processes
 from autotune.design.robust import design_on_points
-from autotune.design.specification import PROBABILITY, UNCERTAIN, Design, Kind, Specification
+from autotune.design.specification import UNCERTAIN, Design, Kind, Specification
 from autotune.design.synthesis import design as synthesised
 from autotune.errors import AutotuneError, DesignError
 from autotune.identification.consistent_structures import consistent_structures
@@ -344,8 +344,8 @@ def _first_kept(
 def _checks(
     source: Source, points: Sequence[FrequencyPoint], fit: PlantFit, controller: PIDController, asked: Specification
 ) -> tuple[Check, ...]:
-    region = PROBABILITY if source == "fitted plant" else None  # the others bound more than the fit's structure
-    found = checks(points, fit, controller, asked, probability=region)
+    # the others bound more than the fit's structure
+    found = checks(points, fit, controller, asked, region=source == "fitted plant")
     if source != "points" and fit.source == "points":
         found = (*found, *_on_structures(points, controller, asked))
     if source == "points" and fit.source == "points" and fit.p_value < CONTRADICTED:

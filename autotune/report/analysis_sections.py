@@ -250,7 +250,7 @@ def _outside(analysis: Analysis) -> str:
 _PROMISES = {
     "reduced model": "margins of every plant that the reduced model bounds: lags and dead time, falling gain and phase",
     "points": "margins of every aperiodic plant through the points' 95 % regions",
-    "fitted plant": "margins of every plant in the 95 % region of the fit, if its structure is right",
+    "fitted plant": "margins of every plant as far from the fit as a rig of that structure lies in 95 of 100",
 }
 
 

@@ -47,10 +47,8 @@ def mean_over_window(data: DelayData, structure: Structure, model: DelayModel) -
     -----
     First order in the drift; what moves faster than the window is averaged as the record weights it.
     """
-    from scipy.signal import lfilter  # here: it takes long to import, and few recordings come this way
-
     usable = data.usable_from(model.delay_s * 1.02)
-    whitening = np.array(model.noise_ar)
+    whitening = model.whitening
     point = solve_linear(usable, structure, model.a, model.delay_s, whitening)
     if not np.isfinite(point.cost) or usable.ty.size < 6 * structure.parameters:
         return model
@@ -58,8 +56,7 @@ def mean_over_window(data: DelayData, structure: Structure, model: DelayModel) -
     middle, half = 0.5 * (usable.ty[0] + usable.ty[-1]), 0.5 * (usable.ty[-1] - usable.ty[0])
     slopes = levels[:, moving] * ((usable.ty - middle) / half)[:, None]
     errors = usable.y - output(usable, model.a, model.delay_s, point.theta)
-    colour = np.concatenate([[1.0], whitening])
-    filtered = lfilter(colour, [1.0], np.column_stack([levels, slopes, errors]), axis=0)[whitening.size :]
+    filtered = whitening.filtered(np.column_stack([levels, slopes, errors]))[whitening.lost :]
     scale = np.linalg.norm(filtered, axis=0) + 1e-300
     matrix = filtered[:, :-1] / scale[:-1]
     if np.linalg.cond(matrix) > 1e7:

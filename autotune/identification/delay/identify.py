@@ -259,7 +259,7 @@ def _require_determined(data: DelayData, model: DelayModel, largest: float) -> N
 def _require_order(data: DelayData, structure: Structure, best: Point, model: DelayModel, largest: float) -> None:
     """Refuse an order that the next lower one does without: what is left over goes into a resonance of the noise."""
     lower = replace(structure, order=structure.order - 1)
-    whitening = np.array(model.noise_ar)
+    whitening = model.whitening
     for candidate in search(data, lower, max_delay_s=largest):
         limit = min(max(1.25 * candidate.point.h, model.delay_s) + 2.0 * abs(model.a[-1] / model.a[-2]), largest)
         usable = data.usable_from(limit)

@@ -214,7 +214,7 @@ def _response(
         return None
     y, residual = data.y.copy(), residuals(usable, point)
     y[-usable.y.size :] -= residual
-    whitening = colour_of(usable, Structure(order=order), point).whitening
+    whitening = colour_of(usable, Structure(order=order), point).whitening.ar
     return np.array([*a, point.theta[0], h]), y, residual, whitening
 
 

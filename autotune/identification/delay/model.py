@@ -11,6 +11,7 @@ import numpy as np
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import InputError
+from autotune.identification.noise_colour import Whitening
 from autotune.models import TransferFunction
 from autotune.text_files import read_json
 
@@ -36,8 +37,9 @@ class DelayModel:
         NaN for what has a value but no covariance.
     noise_sd : float
         Standard deviation of the noise on y, or of its innovation where it is coloured [y unit].
-    noise_ar : tuple of float
-        c_1.. of the noise model (1 + c_1 q^-1 + ..) w = innovation, q^-1 the previous row; empty for white noise.
+    noise_ar, noise_ma : tuple of float
+        c_1.. and d_1.. of the noise model (1 + c_1 q^-1 + ..) w = (1 + d_1 q^-1 + ..) innovation, q^-1 the previous
+        row; both empty for white noise, the latter where no load wanders.
     rows : int
         Rows of y the fit used.
     """
@@ -51,12 +53,18 @@ class DelayModel:
     covariance: FloatArray
     noise_sd: float
     noise_ar: tuple[float, ...] = ()
+    noise_ma: tuple[float, ...] = ()
     rows: int = 0
 
     @property
     def order(self) -> int:
         """Order n."""
         return len(self.a)
+
+    @property
+    def whitening(self) -> Whitening:
+        """The filter that makes the noise white."""
+        return Whitening(ar=np.array(self.noise_ar), ma=np.array(self.noise_ma))
 
     @property
     def standard_deviations(self) -> FloatArray:
@@ -94,7 +102,7 @@ class DelayModel:
             "initial_time_s": self.initial_time_s,
             "initial_state_sd": _or_null(sd[n + 3 :]),
             "covariance": [_or_null(row) for row in self.covariance],
-            "noise": {"sd": self.noise_sd, "ar": list(self.noise_ar)},
+            "noise": {"sd": self.noise_sd, "ar": list(self.noise_ar), "ma": list(self.noise_ma)},
             "rows": self.rows,
         }
 
@@ -124,7 +132,8 @@ def read_delay_model(path: str | os.PathLike[str]) -> DelayModel:
         covariance = np.array(content.get("covariance", np.diag(diagonal)), dtype=np.float64)  # null is NaN
         noise = content.get("noise", {})
         rest = {key: float(content.get(key, 0.0)) for key in ("constant", "initial_time_s")}
-        noise_sd, noise_ar = float(noise.get("sd") or math.nan), tuple(float(value) for value in noise.get("ar", ()))
+        noise_sd = float(noise.get("sd") or math.nan)
+        noise_ar, noise_ma = (tuple(float(value) for value in noise.get(key, ())) for key in ("ar", "ma"))
         rows = int(content.get("rows", 0))
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError):
         raise InputError(
@@ -144,5 +153,6 @@ def read_delay_model(path: str | os.PathLike[str]) -> DelayModel:
         covariance=covariance,
         noise_sd=noise_sd,
         noise_ar=noise_ar,
+        noise_ma=noise_ma,
         rows=rows,
     )

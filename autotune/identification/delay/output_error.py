@@ -18,7 +18,7 @@ from autotune.arrays import BoolArray, FloatArray
 from autotune.identification.delay.compiled import cholesky_solve
 from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.response import linear_part, normal_matrix, output
-from autotune.identification.noise_colour import WHITE
+from autotune.identification.noise_colour import WHITE, Whitening
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +80,7 @@ class Point:
 
 
 def solve_linear(
-    data: DelayData, structure: Structure, a: tuple[float, ...], h: float, whitening: FloatArray = WHITE
+    data: DelayData, structure: Structure, a: tuple[float, ...], h: float, whitening: Whitening = WHITE
 ) -> Point:
     """Return the best b, d and initial state for given (a, h); an unstable response that overflows costs infinity.
 
@@ -94,11 +94,11 @@ def solve_linear(
         Coefficients a_0..a_{n-1}.
     h : float
         Delay [s].
-    whitening : (p,) array
-        Coefficients of the filter that makes the noise white.
+    whitening : Whitening
+        Makes the noise white.
     """
     theta, cost = linear_part(data, a, h, structure.offset, structure.zeros, whitening)
-    return Point(a=a, h=h, theta=theta, cost=cost, rows=data.ty.size - whitening.size)
+    return Point(a=a, h=h, theta=theta, cost=cost, rows=data.ty.size - whitening.lost)
 
 
 def minimise(
@@ -107,7 +107,7 @@ def minimise(
     start: Point,
     *,
     max_delay_s: float,
-    whitening: FloatArray = WHITE,
+    whitening: Whitening = WHITE,
     iterations: int = 30,
     tolerance: float = 1e-4,
     held: int | None = None,
@@ -124,8 +124,8 @@ def minimise(
         Where to begin, evaluated on the same data.
     max_delay_s : float
         Upper limit of h [s].
-    whitening : (p,) array
-        Whitening filter of the noise.
+    whitening : Whitening
+        Makes the noise white.
     iterations : int
         Largest number of accepted steps.
     tolerance : float

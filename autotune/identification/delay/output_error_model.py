@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,14 @@ from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.output_error import Point, Structure, minimise, residuals, solve_linear
 from autotune.identification.delay.response import normal_matrix, sensitivities
-from autotune.identification.noise_colour import MAX_AR, WHITE, NoiseColour, noise_colour
+from autotune.identification.noise_colour import (
+    MAX_AR,
+    WHITE,
+    NoiseColour,
+    Whitening,
+    load_filters,
+    noise_colour,
+)
 
 
 def parameters(data: DelayData, point: Point) -> FloatArray:
@@ -37,7 +45,7 @@ def parameters(data: DelayData, point: Point) -> FloatArray:
     return np.array([*point.a, b, point.h, d - b * data.u_0 - point.a[0] * data.y_0, *initial])
 
 
-def finish(data: DelayData, structure: Structure, point: Point, whitening: FloatArray = WHITE) -> DelayModel:
+def finish(data: DelayData, structure: Structure, point: Point, whitening: Whitening = WHITE) -> DelayModel:
     """Return the model with its covariance at a minimum, the operating point added back.
 
     Parameters
@@ -48,8 +56,8 @@ def finish(data: DelayData, structure: Structure, point: Point, whitening: Float
         Which parameters are free.
     point : Point
         The minimum.
-    whitening : (p,) array
-        Coefficients of the filter that makes the noise white.
+    whitening : Whitening
+        Makes the noise white.
 
     Raises
     ------
@@ -72,13 +80,14 @@ def finish(data: DelayData, structure: Structure, point: Point, whitening: Float
         initial_state=tuple(float(value) for value in values[n + 3 :]),
         covariance=variance * back @ inner @ back.T,
         noise_sd=float(np.sqrt(variance)),
-        noise_ar=tuple(float(value) for value in whitening),
+        noise_ar=tuple(float(value) for value in whitening.ar),
+        noise_ma=tuple(float(value) for value in whitening.ma),
         rows=point.rows,
     )
 
 
 def inverse_information(
-    data: DelayData, structure: Structure, point: Point, whitening: FloatArray = WHITE
+    data: DelayData, structure: Structure, point: Point, whitening: Whitening = WHITE
 ) -> FloatArray | None:
     """Return the inverse of the sensitivities' Gram matrix at a minimum; None where the rows do not determine all.
 
@@ -90,8 +99,8 @@ def inverse_information(
         Which parameters are free.
     point : Point
         The minimum.
-    whitening : (p,) array
-        Coefficients of the filter that makes the noise white.
+    whitening : Whitening
+        Makes the noise white.
 
     Returns
     -------
@@ -148,6 +157,7 @@ def colour_of(
     *,
     max_order: int = MAX_AR,
     samples: NDArray[np.int64] | None = None,
+    loaded: bool = False,
 ) -> NoiseColour:
     """Return the colour of the noise that a point leaves.
 
@@ -163,6 +173,8 @@ def colour_of(
         Largest order of the autoregression.
     samples : (N,) array, optional
         The sample that each row belongs to, ascending from 0: the colour is that of the means over samples.
+    loaded : bool
+        Whether a load may wander besides, as slowly as the plant's slowest lag, and come in where the command does.
 
     Returns
     -------
@@ -176,7 +188,16 @@ def colour_of(
     if samples is not None:
         first = np.flatnonzero(np.diff(samples, prepend=-1))
         rows = np.add.reduceat(rows, first) / np.diff(first, append=len(rows))[:, None]
-    return noise_colour(rows[:, :-1], rows[:, -1], max_order)
+    loads = _load_filters(data, point) if loaded else (WHITE,)
+    return noise_colour(rows[:, :-1], rows[:, -1], max_order, loads)
+
+
+def _load_filters(data: DelayData, point: Point) -> list[Whitening]:
+    step = float(np.median(np.diff(data.ty)))
+    own = np.roots([1.0, *(-value for value in point.a[::-1])]) * step
+    # what lasts longer than the rows is told from a constant by none of them
+    slowest = min((abs(one) for one in own if abs(one) > 1.0 / data.ty.size), default=1.0 / data.ty.size)
+    return load_filters(np.exp(np.append(own, -slowest)), min(slowest, math.pi))
 
 
 def widen_intervals(model: DelayModel, structure: Structure, colour: NoiseColour) -> DelayModel:
@@ -230,9 +251,8 @@ def polish(
     )
     colour = colour_of(data, structure, point, max_order=0)
     for _ in range(3 if coloured else 0):
-        found = colour_of(data, structure, point)
-        same = found.whitening.size == colour.whitening.size
-        if same and np.max(np.abs(found.whitening - colour.whitening), initial=0.0) < 1e-3:
+        found = colour_of(data, structure, point, loaded=True)
+        if _alike(found.whitening, colour.whitening):
             break
         colour = found
         point = minimise(
@@ -245,7 +265,12 @@ def polish(
     return point, colour
 
 
-def _singular(data: DelayData, structure: Structure, point: Point, whitening: FloatArray) -> IdentificationError:
+def _alike(one: Whitening, other: Whitening) -> bool:
+    pairs = ((one.ar, other.ar), (one.ma, other.ma))
+    return all(a.size == b.size and np.max(np.abs(a - b), initial=0.0) < 1e-3 for a, b in pairs)
+
+
+def _singular(data: DelayData, structure: Structure, point: Point, whitening: Whitening) -> IdentificationError:
     n, free = structure.order, np.flatnonzero(structure.free)
     information = normal_matrix(data, point.a, point.h, point.theta, True, whitening)[0][np.ix_(free, free)]
     names = ["b", "constant", *(f"x^({i})(t_s)" for i in range(n)), *(f"a{i}" for i in range(n)), "delay"]

@@ -93,7 +93,7 @@ def _walk(
     n = structure.order
     nonlinear = [*range(n), n + 1]
     reach_of_information = _RISE * model.standard_deviations[j]
-    whitening = np.array(model.noise_ar)
+    whitening = model.whitening
     held = 2 * n + 2 if j == n + 1 else 2 + n + j
     origin = np.append(point.a, point.h)
     j_among = nonlinear.index(j)

@@ -32,6 +32,7 @@ from autotune.identification.delay.propagation import (
     propagate_sensitivities,
     schedule,
 )
+from autotune.identification.noise_colour import Whitening
 
 #: A sum of squares is what y has less what is explained, but below this share of y's, where that difference has lost
 #: its digits: there the residuals are squared themselves.
@@ -44,7 +45,7 @@ def normal_matrix(
     h: float,
     theta: FloatArray,
     sensitive: bool,
-    whitening: FloatArray,
+    whitening: Whitening,
 ) -> tuple[FloatArray, bool]:
     """Return the Gram matrix of the columns and, last, of what they have to explain, and whether it is finite.
 
@@ -60,9 +61,8 @@ def normal_matrix(
         b_0, d, the initial state, b_1..b_m; without sensitivities its size counts and not its values.
     sensitive : bool
         Whether the sensitivities to a and h are wanted besides.
-    whitening : (p,) array
-        Coefficients c_1..c_p of the filter 1 + c_1 q^-1 + ... that makes the noise white; its first p rows are
-        dropped. Empty for white noise. Only for uniform records.
+    whitening : Whitening
+        The filter that makes the noise white. Only for uniform records.
 
     Returns
     -------
@@ -76,19 +76,20 @@ def normal_matrix(
     Time is linear in the rows; memory is one block of rows, whatever the record's length.
     """
     n, m = len(a), theta.size - 2 - len(a)
-    order = whitening.size
+    order, moving = whitening.ar.size, whitening.ma.size
     width = 2 * n + m + 4 if sensitive else 3 + n + m
     gram = np.zeros((width, width))
     coefficients, chains, clock = begin(data.tu, data.ty, a, h, theta)
     rows = np.zeros((order + BLOCK, width))
-    white = np.empty((BLOCK, width))
+    white = np.zeros((moving + BLOCK, width))
     for first, outputs, pieces, F, which in _blocks(data, h, coefficients, clock):
         if not propagate(a, F, which, pieces, m, chains, rows[order:]):
             return gram, False
         if sensitive:
             propagate_sensitivities(a, theta, F, which, pieces, chains, rows[order:])
-        skip = max(0, min(order - first, outputs))
-        _add_rows(gram, rows, white, data.y[first : first + outputs], skip, whitening, sensitive)
+        skip = max(0, min(whitening.lost - first, outputs))
+        y = data.y[first : first + outputs]
+        _add_rows(gram, rows, white, y, skip, whitening.ar, whitening.ma, sensitive)
     return gram, bool(np.all(np.isfinite(gram)))
 
 
@@ -113,31 +114,38 @@ def _add_rows(
     white: FloatArray,
     y: FloatArray,
     skip: int,
-    whitening: FloatArray,
+    ar: FloatArray,
+    ma: FloatArray,
     sensitive: bool,
 ) -> None:
     """Add a block's rows, filtered and but for those to skip, to the Gram matrix; keep what the next block filters."""
-    order, outputs, width = whitening.size, y.size, rows.shape[1]
+    order, moving, outputs, width = ar.size, ma.size, y.size, rows.shape[1]
     for k in range(outputs):
         rows[order + k, width - 1] = y[k] - (rows[order + k, width - 1] if sensitive else 0.0)
     if order > 0:
-        _filter(rows, whitening, skip, outputs, white)
-    used = white[skip:outputs] if order > 0 else rows[:outputs]
+        _filter(rows, ar, ma, outputs, white)
+    used = white[moving + skip : moving + outputs] if order > 0 else rows[:outputs]
     gram += used.T @ used
     for i in range(order):
         for c in range(width):
             rows[i, c] = rows[outputs + i, c]
+    for i in range(moving):
+        for c in range(width):
+            white[i, c] = white[outputs + i, c]
 
 
 @njit(cache=True, nogil=True)
-def _filter(rows: FloatArray, whitening: FloatArray, skip: int, count: int, white: FloatArray) -> None:
-    p = whitening.size
-    for k in range(skip, count):
+def _filter(rows: FloatArray, ar: FloatArray, ma: FloatArray, count: int, white: FloatArray) -> None:
+    """Write filtered rows behind those of the block before, of which both hold as many as the filter looks back."""
+    p, r = ar.size, ma.size
+    for k in range(count):
         for c in range(rows.shape[1]):
             total = rows[p + k, c]
             for i in range(p):
-                total += whitening[i] * rows[p + k - 1 - i, c]
-            white[k, c] = total
+                total += ar[i] * rows[p + k - 1 - i, c]
+            for i in range(r):
+                total -= ma[i] * white[r + k - 1 - i, c]
+            white[r + k, c] = total
 
 
 def output(
@@ -205,7 +213,7 @@ def linear_part(
     h: float,
     offset: bool,
     zeros: int,
-    whitening: FloatArray,
+    whitening: Whitening,
 ) -> tuple[FloatArray, float]:
     """Return the best b, d and initial state for given (a, h), and the sum of squares; infinite where not finite.
 
@@ -221,7 +229,7 @@ def linear_part(
         Whether d is estimated.
     zeros : int
         m, below n.
-    whitening : (p,) array
+    whitening : Whitening
         As of :func:`normal_matrix`.
 
     Returns

@@ -239,7 +239,7 @@ def _correct_quadrature(
     if not coloured or np.unique(at).size < _COLOURED_ROWS or not np.ptp(residual) > 0.0:
         return corrected, None
     colour = colour_of(data, structure, point, samples=at)
-    noise = lfilter([1.0], [1.0, *colour.whitening], corrected.noise[..., ::-1])[..., ::-1]
+    noise = lfilter([1.0], [1.0, *colour.whitening.ar], corrected.noise[..., ::-1])[..., ::-1]
     return replace(corrected, noise=np.asarray(noise)), colour
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from autotune.arrays import BoolArray, ComplexArray, FloatArray, smallest_step
 from autotune.errors import IdentificationError
-from autotune.identification.noise_colour import WHITE, whitening_filter
+from autotune.identification.noise_colour import whitening_filter
 
 #: Part of y that may be missing or wild before the record is refused.
 _LARGEST_BAD_PART = 0.05
@@ -182,6 +182,6 @@ def record_spectra(
 
 def _whitening(e: FloatArray, omega: FloatArray) -> FloatArray:
     """Return the gain of the filter that makes e white at some frequencies [rad/row]; 1 where e is zero."""
-    colour = whitening_filter(e) if np.any(e) else WHITE
+    colour = whitening_filter(e) if np.any(e) else np.empty(0)
     delays = np.exp(-1j * np.outer(omega, np.arange(1, colour.size + 1)))
     return np.asarray(np.abs(1.0 + delays @ colour))

@@ -169,7 +169,7 @@ def test_the_noise_frequency_counts_for_the_bound_too() -> None:
 def test_margins_hold_on_the_region_of_a_fit_and_of_the_structures_that_are_not_excluded() -> None:
     fit = fit_plant(measured(LAG_DOMINATED, 3, phases_deg=(-30.0, -60.0, -80.0, -100.0, -130.0, -150.0)))
     found = design_on_fit(fit, ROOMY)
-    check = on_plants(fit.border(0.95), found.controller, ROOMY, "region")
+    check = on_plants(fit.border(ROOMY.distance), found.controller, ROOMY, "region")
     assert check.kept
     assert margins(LAG_DOMINATED, found.controller).modulus >= 0.5
     assert found.margins.modulus <= margins(fit.plant, found.controller).modulus

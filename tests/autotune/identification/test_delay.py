@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import lsim
+from scipy.signal import lfilter, lsim
 
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay import response
@@ -18,6 +18,7 @@ from autotune.identification.delay.output_error import Point, Structure, solve_l
 from autotune.identification.delay.output_error_model import finish
 from autotune.identification.delay.propagation import schedule
 from autotune.identification.delay.response import linear_part, normal_matrix, output, sensitivities
+from autotune.identification.noise_colour import WHITE, Whitening
 from autotune.recording import Recording, read_recording
 from tests.autotune.identification.delay_examples import X0, A, B, example_2, held_response
 from tests.benchmarks.delay_plants import errors_in_deviations, random_plant, recording_of
@@ -29,8 +30,6 @@ def noisy(recording: Recording, sd: float, seed: int, ar: float = 0.0) -> Record
     """Add noise of the given sd where y is, white or first-order autoregressive."""
     white = np.random.default_rng(seed).standard_normal(len(recording))
     if ar:
-        from scipy.signal import lfilter
-
         white = lfilter([np.sqrt(1 - ar**2)], [1.0, -ar], white)
     return replace(recording, y=recording.y + sd * white)
 
@@ -113,7 +112,7 @@ def test_an_equation_with_zeros_answers_as_its_transfer_function_and_so_do_its_s
     J = np.array([(x(values + d) - x(values - d)) / 2e-6 for d in 1e-6 * np.eye(n + 1)]).T
     columns = sensitivities(data, a, h, theta)
     np.testing.assert_allclose(columns[:, 2 + n + m :], J, atol=1e-6 * np.abs(J).max())
-    best, cost = linear_part(replace(data, y=x(values)), a, h, True, m, np.empty(0))
+    best, cost = linear_part(replace(data, y=x(values)), a, h, True, m, WHITE)
     np.testing.assert_allclose(best, theta, atol=1e-6)
     assert cost < 1e-9
 
@@ -124,7 +123,7 @@ def test_a_higher_order_compiles_its_own_propagation_alone():
     data = DelayData(tu=t, u=np.sin(t), ty=t, y=np.cos(t), linear=False, before=0.0)
 
     def compiled(a: tuple[float, ...]) -> tuple[int, ...]:
-        theta, white = np.zeros(2 + len(a)), np.empty(0)
+        theta, white = np.zeros(2 + len(a)), WHITE
         normal_matrix(data, a, 0.1, theta, True, white)
         linear_part(data, a, 0.1, True, 0, white)
         sensitivities(data, a, 0.1, theta)
@@ -309,12 +308,17 @@ def test_cost_is_the_sum_of_squares_and_the_gram_matrix_is_linear_in_rows():
     x = output(data, A, 4.0, point.theta)
     assert point.cost == pytest.approx(np.sum((data.y - x) ** 2), rel=1e-9)
     args = (data, A, 4.0, point.theta, True)
-    gram, finite = normal_matrix(*args, np.empty(0))
+    gram, finite = normal_matrix(*args, WHITE)
     assert finite
     assert gram[-1, -1] == pytest.approx(point.cost, rel=1e-9)
-    whitened, _ = normal_matrix(*args, np.array([-0.5]))
+    whitened, _ = normal_matrix(*args, Whitening(ar=np.array([-0.5])))
     residual = data.y - x
     assert whitened[-1, -1] == pytest.approx(np.sum((residual[1:] - 0.5 * residual[:-1]) ** 2), rel=1e-9)
+    both = Whitening(ar=np.array([-1.4, 0.45]), ma=np.array([-0.6]))
+    whitened, _ = normal_matrix(*args, both)
+    white = lfilter([1.0, -1.4, 0.45], [1.0, -0.6], residual)[1:]
+    assert whitened[-1, -1] == pytest.approx(white @ white, rel=1e-9)
+    assert both.filtered(residual[:, None])[1:, 0] == pytest.approx(white, abs=1e-12)
 
 
 def test_delay_model_file_round_trip(tmp_path):

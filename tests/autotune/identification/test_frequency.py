@@ -157,7 +157,7 @@ def test_coloured_noise_is_recognised_and_its_level_found_at_low_frequency() -> 
     for k in range(1, white.size):
         coloured[k] = 0.8 * coloured[k - 1] + white[k]
     low, colour = np.array([0.01]), noise_colour(np.ones((coloured.size, 1)), coloured)
-    assert colour.whitening.size
+    assert colour.whitening.ar.size
     assert colour.variance_at(low)[0] == pytest.approx(25.0, rel=0.2)
     assert noise_colour(np.ones((white.size, 1)), white).variance_at(low)[0] == pytest.approx(1.0, rel=0.1)
 

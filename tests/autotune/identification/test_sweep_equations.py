@@ -11,6 +11,7 @@ from autotune.errors import IdentificationError
 from autotune.identification import sweep_equations
 from autotune.identification.delay.data import DelayData, prepare
 from autotune.identification.delay.output_error import Point, Structure, minimise, solve_linear
+from autotune.identification.noise_colour import WHITE
 from autotune.identification.sweep_equations import Fitted, fit_again
 from autotune.recording import Recording
 
@@ -49,7 +50,7 @@ def test_the_search_for_a_dead_time_ends_with_the_rows_of_which_it_may_be(monkey
     monkeypatch.setattr(sweep_equations, "minimise", counted)
     start = begun_off(data)
     with suppress(IdentificationError):  # whether these rows determine what no equation describes hangs on rounding
-        fit_again(data, [start], longest_s, np.empty(0))
+        fit_again(data, [start], longest_s, WHITE)
     assert min(point.cost for point in descents) < start.point.cost
     assert 3 < len(descents) <= 3 + longest_s / STEP_S
 
@@ -57,5 +58,5 @@ def test_the_search_for_a_dead_time_ends_with_the_rows_of_which_it_may_be(monkey
 def test_an_equation_that_its_rows_determine_is_fitted_lower_than_it_began() -> None:
     data = under_a_command_that_clips(seed=6)
     start = begun_off(data)
-    (found,) = fit_again(data, [start], 0.3, np.empty(0))
+    (found,) = fit_again(data, [start], 0.3, WHITE)
     assert found.point.cost < start.point.cost
