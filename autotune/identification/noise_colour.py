@@ -34,7 +34,7 @@ from autotune.distributions import chi2_quantile
 
 MAX_AR = 12
 #: What a load adds to the density of the other noise at its own corner frequency, from hardly anything to all.
-_LOADS = np.geomspace(0.03, 1000.0, 19)
+_LOADS = np.geomspace(0.03, 1000.0, 10)
 #: Step of a difference quotient in a parameter, which is known to some 1/sqrt(rows).
 _DIFFERENCE = 1e-3
 #: Share of products below which they are rounding, as those of exact data are.
