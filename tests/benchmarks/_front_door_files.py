@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,13 +81,17 @@ def open_loop(
 
 def closed_loop(
     plant: TransferFunction, r: FloatArray, step_s: float, K: float, Ti: float, noise: float, y_0: float, u_0: float,
-    seed: int,
+    seed: int, pole: float = 0.0,
 ) -> Rows:  # fmt: skip
-    """Return a record of a loop under a PI that moves its set-point; process noise is a slow first-order load."""
+    """Return a record of a loop under a PI that moves its set-point; process noise is a slow first-order load.
+
+    ``pole`` is that of the sensor's noise from row to row.
+    """
     rng, model = np.random.default_rng(seed), _Plant(plant, step_s)
-    u, y, total, load = np.empty(r.size), np.empty(r.size), 0.0, 0.0
+    u, y, total, load, of_sensor = np.empty(r.size), np.empty(r.size), 0.0, 0.0, 0.0
     for k, wanted in enumerate(r):
-        y[k] = model.output() + noise * rng.standard_normal()
+        of_sensor = pole * of_sensor + math.sqrt(1.0 - pole**2) * rng.standard_normal()
+        y[k] = model.output() + noise * of_sensor
         error = wanted - y[k]
         total += K * step_s / Ti * error
         u[k] = K * error + total

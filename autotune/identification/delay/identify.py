@@ -18,7 +18,7 @@ from autotune.identification.delay.output_error import Point, Structure, minimis
 from autotune.identification.delay.output_error_model import finish, polish, widen_intervals
 from autotune.identification.delay.profile import profile
 from autotune.identification.delay.search import average_bins, scan, search
-from autotune.identification.noise_colour import whitening_filter
+from autotune.identification.noise_colour import WHITE, whitening_filter
 from autotune.models import Hold
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
@@ -218,11 +218,13 @@ def _polish_on_all_rows(
         sd = finish(rough, structure, best).standard_deviations[structure.order + 1]
         if best.h < limit or limit >= largest:
             break
+    whitening = WHITE
     for _ in range(_MINIMA):
         limit = min(best.h + 8.0 * float(sd) + 2.0 * step, largest)
         usable = data.usable_from(limit)
-        best, colour = polish(usable, structure, best, max_delay_s=limit, coloured=coloured)
-        model = finish(usable, structure, best, colour.whitening)
+        best, colour = polish(usable, structure, best, max_delay_s=limit, coloured=coloured, whitening=whitening)
+        whitening = colour.whitening
+        model = finish(usable, structure, best, whitening)
         _require_inside(data, model, largest)
         if model.standard_deviations[structure.order] < _LINEAR * abs(model.b):
             return widen_intervals(model, structure, colour)

@@ -23,6 +23,9 @@ from autotune.identification.noise_colour import (
     noise_colour,
 )
 
+#: Time constants from one row to the next after which nothing of a lag is left but rounding.
+_NOTHING_LEFT = -math.log(np.finfo(np.float64).eps)
+
 
 def parameters(data: DelayData, point: Point) -> FloatArray:
     """Return (a_0.., b, delay, constant, initial state) of a point, the operating point added back.
@@ -195,9 +198,11 @@ def colour_of(
 def _load_filters(data: DelayData, point: Point) -> list[Whitening]:
     step = float(np.median(np.diff(data.ty)))
     own = np.roots([1.0, *(-value for value in point.a[::-1])]) * step
+    own = own[np.abs(own.real) < _NOTHING_LEFT]
     # what lasts longer than the rows is told from a constant by none of them
     slowest = min((abs(one) for one in own if abs(one) > 1.0 / data.ty.size), default=1.0 / data.ty.size)
-    return load_filters(np.exp(np.append(own, -slowest)), min(slowest, math.pi))
+    slowest = min(slowest, math.pi)
+    return load_filters(np.exp(np.append(own, -slowest)), slowest)
 
 
 def widen_intervals(model: DelayModel, structure: Structure, colour: NoiseColour) -> DelayModel:
@@ -218,7 +223,13 @@ def widen_intervals(model: DelayModel, structure: Structure, colour: NoiseColour
 
 
 def polish(
-    data: DelayData, structure: Structure, start: Point, *, max_delay_s: float, coloured: bool = True
+    data: DelayData,
+    structure: Structure,
+    start: Point,
+    *,
+    max_delay_s: float,
+    coloured: bool = True,
+    whitening: Whitening = WHITE,
 ) -> tuple[Point, NoiseColour]:
     """Fit from a starting point, find the noise's colour, fit again under it; return minimum and colour.
 
@@ -234,6 +245,8 @@ def polish(
         Upper limit of h [s].
     coloured : bool
         Whether the noise may be coloured; white is assumed otherwise.
+    whitening : Whitening
+        Under which the starting point was found, and is left for the next minimum.
 
     Raises
     ------
@@ -247,7 +260,12 @@ def polish(
             remedy="record longer than the delay, or say what u was before the record",
         )
     point = minimise(
-        data, structure, solve_linear(data, structure, start.a, start.h), max_delay_s=max_delay_s, iterations=50
+        data,
+        structure,
+        solve_linear(data, structure, start.a, start.h, whitening),
+        max_delay_s=max_delay_s,
+        whitening=whitening,
+        iterations=50,
     )
     colour = colour_of(data, structure, point, max_order=0)
     for _ in range(3 if coloured else 0):
