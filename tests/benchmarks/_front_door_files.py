@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.linalg import expm
+from scipy.signal import lfilter
 
 from autotune.arrays import FloatArray
 from autotune.models import TransferFunction
@@ -68,14 +69,18 @@ class _Plant:
 
 
 def open_loop(
-    plant: TransferFunction, u: FloatArray, step_s: float, noise: float, y_0: float, u_0: float, seed: int
-) -> Rows:
+    plant: TransferFunction, u: FloatArray, step_s: float, noise: float, y_0: float, u_0: float, seed: int,
+    pole: float = 0.0,
+) -> Rows:  # fmt: skip
+    """Return a record of a plant under commands; ``pole`` is that of the sensor's noise from row to row."""
     rng, model = np.random.default_rng(seed), _Plant(plant, step_s)
     y = np.empty(u.size)
     for k, value in enumerate(u):
         y[k] = model.output()
         model.hold(value)
-    y = y_0 + y + noise * rng.standard_normal(u.size)
+    white = math.sqrt(1.0 - pole**2) * rng.standard_normal(u.size)
+    of_sensor = white if pole == 0.0 else lfilter([1.0], [1.0, -pole], white)
+    y = y_0 + y + noise * of_sensor
     return Rows(t=step_s * np.arange(u.size), u=u_0 + u, y=y)
 
 
