@@ -66,7 +66,7 @@ class LoadStep:
         spectrum = np.zeros(self.rows // 2 + 1, dtype=np.complex128)
         spectrum[1 : 2 * s.size : 2] = self.h / (1.0 + self.h * C) * wave
         y = irfft(spectrum, self.rows)
-        size, following = np.abs(y), np.roll(y, -1)
+        size, following = np.abs(y), np.append(y[1:], y[0])
         # on a straight line from row to row: without it the sum has a ripple that searches end in
         crossing = np.flatnonzero(y * following < 0.0)
         a, b = size[crossing], np.abs(following[crossing])

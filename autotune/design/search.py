@@ -74,6 +74,14 @@ class Problem:
         slacks = np.stack([self.slacks_of(i, figures) for i, figures in enumerate(found)], axis=1)
         return np.asarray(found[0].squared_norm), slacks
 
+    def figures_at(self, parameters: FloatArray) -> list[Figures]:
+        """Return the figures of one controller, its (4,) parameters as in :meth:`norms_and_slacks`, on each plant."""
+        return [evaluate(s.omega, s.h, s.weights, s.turn, *parameters, self.omega_n) for s in self.sampled]
+
+    def slacks_at(self, parameters: FloatArray) -> FloatArray:
+        """Return the (S, 4) slacks of one controller, its (4,) parameters as in :meth:`norms_and_slacks`."""
+        return np.array([self.slacks_of(i, figures) for i, figures in enumerate(self.figures_at(parameters))])
+
     def slacks_of(self, plant: int, figures: Figures) -> FloatArray:
         """Return the slacks of the figures on a plant.
 
@@ -123,7 +131,7 @@ class Problem:
         offset : (S, 4) array
             What they were shifted by.
         """
-        coarse = self.norms_and_slacks(parameters[None, :])[1][0]
+        coarse = self.slacks_at(parameters)
         exact = self.exact_slacks(parameters, coarse)
         with np.errstate(invalid="ignore"):
             step = np.where(np.isfinite(coarse), coarse - exact, 0.0)
@@ -131,7 +139,7 @@ class Problem:
 
     def kept(self, parameters: FloatArray) -> bool:
         """Whether all plants keep the specification exactly."""
-        coarse = self.norms_and_slacks(parameters[None, :])[1][0]
+        coarse = self.slacks_at(parameters)
         return bool(np.min(self.exact_slacks(parameters, coarse)) >= -_TOLERANCE)
 
     def controller(self, parameters: FloatArray) -> PIDController:
@@ -228,7 +236,6 @@ def _local_search(problem: Problem, start: FloatArray, offset: FloatArray) -> tu
     """
     free = start > 0.0
     specification = problem.specification
-    data = [(plant.omega, plant.h, plant.weights, plant.turn) for plant in problem.sampled]
     asked = [0, 1, 2, 3] if specification.delay_margin_s > 0.0 else [0, 1, 2]
     memory: dict[bytes, tuple[float, FloatArray]] = {}
     best: tuple[float, FloatArray] = (math.inf, start)
@@ -239,7 +246,7 @@ def _local_search(problem: Problem, start: FloatArray, offset: FloatArray) -> tu
         if key not in memory:
             p = start.copy()
             p[free] = start[free] * np.exp(x)
-            found = [evaluate(*plant, p[0], p[1], p[2], p[3], problem.omega_n) for plant in data]
+            found = problem.figures_at(p)
             slack = np.array([problem.slacks_of(i, figures) for i, figures in enumerate(found)]) - offset
             slack = np.minimum(slack[:, asked], MOST_SLACK).ravel()
             squared = float(found[0].squared_norm)

@@ -113,17 +113,12 @@ class Specification:
             noise = figures.noise_gain / self.noise_gain
         else:
             noise = figures.controller_gain / (self.modulus_margin * self.noise_gain)
-        delay: float | FloatArray = np.full(np.shape(noise), np.inf)
         if self.delay_margin_s > 0.0:
             delay = figures.delay_s / self.delay_margin_s - 1.0
-        found = np.array(
-            (
-                figures.modulus / self.modulus_margin - 1.0,
-                figures.phase_rad / self.phase_margin_rad - 1.0,
-                1.0 - noise,
-                delay,
-            )
-        )
+        else:
+            delay = np.full(np.shape(noise), np.inf) if np.ndim(noise) else np.inf
+        modulus, phase = figures.modulus / self.modulus_margin - 1.0, figures.phase_rad / self.phase_margin_rad - 1.0
+        found = np.array((modulus, phase, 1.0 - noise, delay))
         return found if found.ndim == 1 else np.moveaxis(found, 0, -1)
 
     def binding(self, figures: Figures) -> tuple[str, ...]:

@@ -152,7 +152,7 @@ def _least_error(problem: Problem, controller: PIDController) -> PIDController:
     load = load_step(lambda omega: np.asarray(sampled.sign * H.response(omega)), start, crossover, H.delay_s)
 
     def slacks(p: FloatArray) -> FloatArray:
-        return np.asarray(problem.norms_and_slacks(p[None, :])[1][0] - offset)
+        return np.asarray(problem.slacks_at(p) - offset)
 
     offset, best = np.zeros((len(problem.plants), 4)), start
     p = least_error(load, slacks, start)
