@@ -194,13 +194,13 @@ def load_filters(poles: ComplexArray, corner: float) -> list[Whitening]:
     for square, pole in zip(squares, poles, strict=True):
         product = np.convolve(product, np.array([square / unit, pole]))
     at_corner = float(np.abs(np.polyval(product[::-1], 2.0 * (1.0 - math.cos(corner)) / unit)))
-    ar = np.real(np.poly(poles))[1:]
+    ar = np.real(np.poly(poles))[1:].copy()  # rows in memory, as all filters are: another layout is compiled again
     found = [WHITE]
     for ratio in _LOADS:
         w = unit * np.roots((product + ratio * at_corner * (np.arange(product.size) == 0))[::-1])
         root = np.sqrt(-0.5 * w * (2.0 - 0.5 * w))
         zeros = 1.0 - 0.5 * w - np.where(np.abs(1.0 - 0.5 * w - root) < 1.0, root, -root)
-        found.append(Whitening(ar=ar, ma=np.real(np.poly(zeros))[1:]))
+        found.append(Whitening(ar=ar, ma=np.real(np.poly(zeros))[1:].copy()))
     return found
 
 
