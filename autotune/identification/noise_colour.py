@@ -69,7 +69,10 @@ class Whitening:
 
     def filtered(self, signals: FloatArray) -> FloatArray:
         """Return signals (N, S) filtered as if nothing had been before them, (N, S)."""
-        return np.asarray(_filtered(np.ascontiguousarray(signals), self.ar, self.ma))
+        rows = np.vstack([np.zeros((self.ar.size, signals.shape[1])), signals])
+        white = np.zeros((self.ma.size + len(signals), signals.shape[1]))
+        filter_rows(rows, self.ar, self.ma, white)
+        return white[self.ma.size :]
 
 
 WHITE = Whitening()
@@ -159,17 +162,27 @@ def _autocovariances(values: FloatArray, lags: int) -> FloatArray:
 
 
 @njit(cache=True, nogil=True)
-def _filtered(signals: FloatArray, ar: FloatArray, ma: FloatArray) -> FloatArray:
-    white = np.empty_like(signals)
-    for k in range(signals.shape[0]):
-        for c in range(signals.shape[1]):
-            total = signals[k, c]
-            for i in range(min(k, ar.size)):
-                total += ar[i] * signals[k - 1 - i, c]
-            for i in range(min(k, ma.size)):
-                total -= ma[i] * white[k - 1 - i, c]
-            white[k, c] = total
-    return white
+def filter_rows(rows: FloatArray, ar: FloatArray, ma: FloatArray, white: FloatArray) -> None:
+    """Write the filtered rows.
+
+    Parameters
+    ----------
+    rows : (p + N, S) array
+        Signals, after those of the p rows before them.
+    ar, ma : (p,) and (r,) arrays
+        The filter's, as of :class:`Whitening`.
+    white : (r + N, S) array
+        Where they are written, after the r filtered ones before them.
+    """
+    p, r = ar.size, ma.size
+    for k in range(rows.shape[0] - p):
+        for c in range(rows.shape[1]):
+            total = rows[p + k, c]
+            for i in range(p):
+                total += ar[i] * rows[p + k - 1 - i, c]
+            for i in range(r):
+                total -= ma[i] * white[r + k - 1 - i, c]
+            white[r + k, c] = total
 
 
 def load_filters(poles: ComplexArray, corner: float) -> list[Whitening]:
@@ -218,7 +231,7 @@ def _likeliest(
         of_load = load.filtered(signals)
         if not np.all(np.isfinite(of_load)):
             continue
-        ar = whitening_filter(of_load[:, -1], max_order)
+        ar = whitening_filter(of_load[:, -1].copy(), max_order)
         white = Whitening(ar=ar).filtered(of_load)[order:]
         gram = white.T @ white
         of_columns, across = gram[:-1, :-1], gram[:-1, -1]

@@ -246,7 +246,7 @@ def polish(
     coloured : bool
         Whether the noise may be coloured; white is assumed otherwise.
     whitening : Whitening
-        Under which the starting point was found, and is left for the next minimum.
+        Under which the fit begins: that of the noise which the starting point was found with.
 
     Raises
     ------

@@ -32,7 +32,7 @@ from autotune.identification.delay.propagation import (
     propagate_sensitivities,
     schedule,
 )
-from autotune.identification.noise_colour import Whitening
+from autotune.identification.noise_colour import Whitening, filter_rows
 
 #: A sum of squares is what y has less what is explained, but below this share of y's, where that difference has lost
 #: its digits: there the residuals are squared themselves.
@@ -123,7 +123,7 @@ def _add_rows(
     for k in range(outputs):
         rows[order + k, width - 1] = y[k] - (rows[order + k, width - 1] if sensitive else 0.0)
     if order > 0:
-        _filter(rows, ar, ma, outputs, white)
+        filter_rows(rows[: order + outputs], ar, ma, white)
     used = white[moving + skip : moving + outputs] if order > 0 else rows[:outputs]
     gram += used.T @ used
     for i in range(order):
@@ -132,20 +132,6 @@ def _add_rows(
     for i in range(moving):
         for c in range(width):
             white[i, c] = white[outputs + i, c]
-
-
-@njit(cache=True, nogil=True)
-def _filter(rows: FloatArray, ar: FloatArray, ma: FloatArray, count: int, white: FloatArray) -> None:
-    """Write filtered rows behind those of the block before, of which both hold as many as the filter looks back."""
-    p, r = ar.size, ma.size
-    for k in range(count):
-        for c in range(rows.shape[1]):
-            total = rows[p + k, c]
-            for i in range(p):
-                total += ar[i] * rows[p + k - 1 - i, c]
-            for i in range(r):
-                total -= ma[i] * white[r + k - 1 - i, c]
-            white[r + k, c] = total
 
 
 def output(
