@@ -15,7 +15,7 @@ from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.output_error import Point, Structure, minimise, solve_linear
 from autotune.identification.delay.output_error_model import inverse_information
 from autotune.identification.equation_region import Equation
-from autotune.identification.noise_colour import Whitening
+from autotune.identification.noise_filter import Whitening
 from autotune.points import FrequencyPoint
 
 _ORDERS, _ZEROS = (1, 2, 3, 4), (0, 1)

@@ -28,7 +28,7 @@ from autotune.identification.delay.data import prepare
 from autotune.identification.envelope import polar_sd
 from autotune.identification.equation_region import plant_fit
 from autotune.identification.frequency.limit_cycle import WholePeriods
-from autotune.identification.noise_colour import Whitening
+from autotune.identification.noise_filter import Whitening
 from autotune.identification.parametric import PlantFit
 from autotune.identification.sweep_adequacy import TESTS, colour_beside, judge_equation, own_columns
 from autotune.identification.sweep_equations import Fitted, as_parts, fit_again, fit_from_points

@@ -18,7 +18,8 @@ from autotune.identification.delay.output_error import Point, Structure, minimis
 from autotune.identification.delay.output_error_model import finish, polish, widen_intervals
 from autotune.identification.delay.profile import profile
 from autotune.identification.delay.search import average_bins, scan, search
-from autotune.identification.noise_colour import WHITE, whitening_filter
+from autotune.identification.noise_colour import whitening_filter
+from autotune.identification.noise_filter import WHITE
 from autotune.models import Hold
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording

@@ -11,7 +11,7 @@ import numpy as np
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import InputError
-from autotune.identification.noise_colour import Whitening
+from autotune.identification.noise_filter import Whitening
 from autotune.models import TransferFunction
 from autotune.text_files import read_json
 

@@ -18,7 +18,7 @@ from autotune.arrays import BoolArray, FloatArray
 from autotune.identification.delay.compiled import cholesky_solve
 from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.response import linear_part, normal_matrix, output
-from autotune.identification.noise_colour import WHITE, Whitening
+from autotune.identification.noise_filter import WHITE, Whitening
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -14,14 +14,8 @@ from autotune.identification.delay.data import DelayData
 from autotune.identification.delay.model import DelayModel
 from autotune.identification.delay.output_error import Point, Structure, minimise, residuals, solve_linear
 from autotune.identification.delay.response import normal_matrix, sensitivities
-from autotune.identification.noise_colour import (
-    MAX_AR,
-    WHITE,
-    NoiseColour,
-    Whitening,
-    load_filters,
-    noise_colour,
-)
+from autotune.identification.noise_colour import MAX_AR, NoiseColour, noise_colour
+from autotune.identification.noise_filter import WHITE, Whitening, load_filters
 
 #: Time constants from one row to the next after which nothing of a lag is left but rounding.
 _NOTHING_LEFT = -math.log(np.finfo(np.float64).eps)

@@ -32,7 +32,7 @@ from autotune.identification.delay.propagation import (
     propagate_sensitivities,
     schedule,
 )
-from autotune.identification.noise_colour import Whitening, filter_rows
+from autotune.identification.noise_filter import Whitening, filter_rows
 
 #: A sum of squares is what y has less what is explained, but below this share of y's, where that difference has lost
 #: its digits: there the residuals are squared themselves.

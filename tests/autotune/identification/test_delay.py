@@ -18,7 +18,7 @@ from autotune.identification.delay.output_error import Point, Structure, solve_l
 from autotune.identification.delay.output_error_model import finish
 from autotune.identification.delay.propagation import schedule
 from autotune.identification.delay.response import linear_part, normal_matrix, output, sensitivities
-from autotune.identification.noise_colour import WHITE, Whitening
+from autotune.identification.noise_filter import WHITE, Whitening
 from autotune.recording import Recording, read_recording
 from tests.autotune.identification.delay_examples import X0, A, B, example_2, held_response
 from tests.benchmarks.delay_plants import errors_in_deviations, random_plant, recording_of

@@ -14,14 +14,8 @@ from autotune.identification.delay.data import prepare
 from autotune.identification.delay.identify import identify_delay
 from autotune.identification.delay.output_error import Structure, residuals, solve_linear
 from autotune.identification.delay.output_error_model import colour_of
-from autotune.identification.noise_colour import (
-    WHITE,
-    NoiseColour,
-    Whitening,
-    load_filters,
-    noise_colour,
-    whitening_filter,
-)
+from autotune.identification.noise_colour import NoiseColour, noise_colour, whitening_filter
+from autotune.identification.noise_filter import WHITE, Whitening, load_filters
 from autotune.recording import Recording
 from tests.benchmarks._front_door_files import OVEN, closed_loop, levels
 

@@ -11,7 +11,7 @@ from autotune.errors import IdentificationError
 from autotune.identification import sweep_equations
 from autotune.identification.delay.data import DelayData, prepare
 from autotune.identification.delay.output_error import Point, Structure, minimise, solve_linear
-from autotune.identification.noise_colour import WHITE
+from autotune.identification.noise_filter import WHITE
 from autotune.identification.sweep_equations import Fitted, fit_again
 from autotune.recording import Recording
 
