@@ -111,7 +111,6 @@ def describe(model: DelayModel) -> str:
     parts += [f"a{i} {value:.4g} +- {1.96 * sd[i]:.2g}" for i, value in enumerate(model.a)]
     parts.append(f"b {model.b:.4g} +- {1.96 * sd[n]:.2g}")
     order = model.whitening.lost
-    colour = (f"coloured (order {order})" if order else "white") + (
-        " beside a wandering load" if model.noise_ma else ""
-    )
-    return f"{', '.join(parts)} (95 %), noise {colour}, sd {model.noise_sd:.3g}"
+    colour = f"coloured (order {order})" if order else "white"
+    load = " beside a wandering load" if model.noise_ma else ""
+    return f"{', '.join(parts)} (95 %), noise {colour}{load}, sd {model.noise_sd:.3g}"

@@ -174,10 +174,11 @@ def noise_colour(
     NoiseColour
         Of the order that the residual asks for.
     """
-    load, start = WHITE, whitening_filter(residual, max_order)
     if len(loads) > 1:
         load, start = _likeliest(columns, residual, loads, max_order)
         columns, residual = load.filtered(columns), load.filtered(residual[:, None])[:, 0]
+    else:
+        load, start = loads[0], whitening_filter(residual, max_order)
     likelihood = _Restricted.of(columns, residual, start.size)
     partial = likelihood.parameters(_partial_correlations(start))
     if start.size:

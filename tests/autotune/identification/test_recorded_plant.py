@@ -49,7 +49,7 @@ def test_the_region_is_no_wider_than_the_record_where_a_controller_works(seed: i
     recording = recorded(seed)
     y, fit = recording.y, fit_recordings([recording])
     assert fit.parameters.size == 4
-    plants = fit.border(2.8)
+    plants = fit.border(float(np.sqrt(chi2.ppf(0.95, fit.parameters.size))))
 
     def deviance(plant: TransferFunction) -> float:
         error = y - answer(plant)
