@@ -198,16 +198,32 @@ def test_the_host_takes_over_without_a_bump(bench: Bench) -> None:
     assert bench.device.value["safe"] == pytest.approx(U_SAFE)
 
 
-@pytest.mark.parametrize("bench", REAL, indirect=True)
-def test_reading_alone_keeps_the_host_in_command(bench: Bench) -> None:
+def _reads_on(bench: Bench) -> tuple[float, float]:
+    """Read for longer than the dead-man time; return the longest wait between two requests [s] and the last output."""
     rig = bench.rig
     rig.open()
-    rig.write(0.25)
-    start_s = rig.clock.now()
-    while rig.clock.now() < start_s + 1.5 * DEADMAN_S:
-        rig.clock.sleep_until(rig.clock.now() + 0.02)
-        rig.read()
-    assert bench.output() == pytest.approx(0.25)
+    asked_s = rig.clock.now()
+    end_s, longest_s, output = asked_s + 1.5 * DEADMAN_S, 0.0, math.nan
+    try:
+        rig.write(0.25)
+        while asked_s < end_s:
+            rig.clock.sleep_until(asked_s + 0.02)
+            before_s = rig.clock.now()
+            rig.read()
+            output = bench.output()
+            longest_s, asked_s = max(longest_s, rig.clock.now() - asked_s), before_s
+    except LinkError:
+        longest_s, output = max(longest_s, rig.clock.now() - asked_s), math.nan
+    rig.close()
+    return longest_s, output
+
+
+@pytest.mark.parametrize("bench", REAL, indirect=True)
+def test_reading_alone_keeps_the_host_in_command(bench: Bench) -> None:
+    longest_s = DEADMAN_S
+    while longest_s >= DEADMAN_S:  # where a busy computer holds the host up for so long, the dead-man is right
+        longest_s, output = _reads_on(bench)
+    assert output == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize("bench", REAL, indirect=True)
