@@ -269,6 +269,11 @@ class Model:
         return sum(block.dynamics.delay_s for block in self.blocks)
 
     @property
+    def signal_units(self) -> dict[str, str]:
+        """Units of a recording's u and y."""
+        return {"u": self.input.unit, "y": self.output.unit}
+
+    @property
     def plant_input_unit(self) -> str:
         """Unit of the plant's input: an actuator's output as far as one is stated, else the command's."""
         return next((b.unit for b in self.blocks if b.place == "actuator" and b.unit), self.input.unit)

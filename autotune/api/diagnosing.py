@@ -38,7 +38,7 @@ def simulate(model: Any, recording: Source, *, horizon_s: float | None = None) -
     """
     from autotune.diagnosis import forecast
     from autotune.equations.files import forecast_any
-    from autotune.equations.recorded_units import require_units_of_model
+    from autotune.recorded_units import require_units_of_model
 
     if horizon_s is not None:
         horizon_s = number(horizon_s, name="horizon_s", where="simulate", above=0.0)
@@ -83,7 +83,7 @@ def diagnose(model: Any, recordings: Source, controller: Any = None, **settings:
     """
     import autotune.api.shown_diagnosis  # noqa: F401 - it registers the table
     from autotune.diagnosis import diagnose as search
-    from autotune.equations.recorded_units import require_units_of_each_other, require_units_of_model
+    from autotune.recorded_units import require_units_of_each_other, require_units_of_model
 
     law = None if controller is None else as_controller(controller)
     given, records = _model(model), all_of(recordings)

@@ -23,7 +23,6 @@ from autotune.design.margins import Margins, margins
 from autotune.design.noise import LoopFacts
 from autotune.diagnosis.diagnose import diagnose
 from autotune.diagnosis.result import Diagnosis
-from autotune.equations.recorded_units import require_units_of_model
 from autotune.errors import AutotuneError, IdentificationError
 from autotune.experiment_design.next_experiment import with_next_experiment
 from autotune.identification.answer import require_answer
@@ -35,6 +34,7 @@ from autotune.identification.parametric import PlantFit
 from autotune.model_file import read_model
 from autotune.pipeline import Analysis, Measured, analyse, analysis_json, measure_plant
 from autotune.points import FrequencyPoint, points_to_json
+from autotune.recorded_units import require_units_of_model
 from autotune.recording import Recording
 from autotune.whole_files import jsonable
 

@@ -46,9 +46,9 @@ def simulate(
 
     from autotune.diagnosis.simulation.forecast import forecast
     from autotune.equations.files import forecast_any as of_any
-    from autotune.equations.recorded_units import require_units_of_model
     from autotune.model_file import read_any as read_any_model
     from autotune.models import Model
+    from autotune.recorded_units import require_units_of_model
 
     place = Output(out, inputs=(recording, model), overwrite=overwrite)
     data = read_one(recording, signal_names(t, u, y, r), moving=False)
@@ -130,9 +130,9 @@ def diagnose(
     from autotune.controller import read_controller
     from autotune.diagnosis.diagnose import diagnose as find
     from autotune.equations.files import write_any
-    from autotune.equations.recorded_units import require_units_of_model
     from autotune.experiment_design.next_experiment import with_next_experiment
     from autotune.model_file import read_any as read_any_model
+    from autotune.recorded_units import require_units_of_model
     from autotune.report.diagnosis_page import write_diagnosis_page
 
     files = ("diagnosis.json", "extended_model.toml", "report.html")

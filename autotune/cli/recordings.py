@@ -51,7 +51,7 @@ def read_all(paths: Iterable[Path], names: SignalNames) -> list[Recording]:
     InputError
         A file that is no recording, or units that differ.
     """
-    from autotune.equations.recorded_units import require_units_of_each_other
+    from autotune.recorded_units import require_units_of_each_other
     from autotune.recording import usable
 
     recordings = [usable(recording) for path in paths for recording in _read(path, names).recordings]

@@ -19,8 +19,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import highspy
 import numpy as np
 from scipy.optimize import linprog, nnls
 
@@ -28,6 +28,9 @@ from autotune.arrays import BoolArray, FloatArray
 from autotune.design.specification import PROBABILITY
 from autotune.errors import DesignError
 from autotune.points import FrequencyPoint
+
+if TYPE_CHECKING:
+    import highspy
 
 DIRECTIONS = 12
 _FACETS = 12
@@ -121,6 +124,8 @@ def _maximum(program: highspy.Highs, what: str) -> float:
     Neighbouring lags are so nearly alike that now and then the last vertex's basis is too ill conditioned for the
     solver to decide anything, which says nothing about the points: their regions bound every member.
     """
+    import highspy
+
     program.run()
     if program.getModelStatus() != highspy.HighsModelStatus.kOptimal:
         program.clearSolver()
@@ -139,6 +144,8 @@ def _maximum(program: highspy.Highs, what: str) -> float:
 
 def _program(A: FloatArray, b: FloatArray) -> highspy.Highs:
     """Return max 0 x subject to A x <= b and the class's bounds on x, ready for its costs."""
+    import highspy
+
     F, V = A.shape
     lower, upper = np.zeros(V), np.full(V, np.inf)
     lower[0], upper[1] = -np.inf, 1.0

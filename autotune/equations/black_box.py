@@ -60,6 +60,11 @@ class BlackBox:
     source: Mapping[str, Any] = None  # type: ignore[assignment]
 
     @property
+    def signal_units(self) -> dict[str, str]:
+        """Units of the columns that drive it, and of y."""
+        return {one.column: one.unit for one in self.inputs} | {"y": self.output_unit}
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """Columns of the recording that drive it."""
         return tuple(one.column for one in self.inputs)

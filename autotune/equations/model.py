@@ -193,6 +193,11 @@ class EquationModel:
         return any(state.start is not None for state in self.states)
 
     @property
+    def signal_units(self) -> dict[str, str]:
+        """Units of the columns that drive it, and of y."""
+        return {one.column: one.unit for one in self.inputs} | {"y": self.output_unit}
+
+    @property
     def columns(self) -> tuple[str, ...]:
         """Columns of the recording that drive the model, in the order of every input matrix."""
         return tuple(one.column for one in self.inputs)

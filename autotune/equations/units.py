@@ -8,43 +8,11 @@ compared. What has no unit in the file matches everything.
 from __future__ import annotations
 
 import math
-import re
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
 
 from autotune.equations.expressions import Call, Expression, Name, Number, to_text
 from autotune.equations.model import EquationModel
 from autotune.errors import InputError
-
-#: Units that engineers write and the library of units does not know; they have no dimension.
-PLAIN = {"", "1", "-", "%", "count", "counts", "step", "steps", "lsb", "digit", "pu", "p.u.", "duty", "pwm"}
-_SPELT = {"°C": "degC", "°F": "degF", "°": "deg", "Ω": "ohm", "µ": "u", "²": "^2", "³": "^3", "·": " ", "⋅": " ",
-          "Nm^3": "m^3", "Nm3": "m^3"}  # fmt: skip
-#: What engineers mean by names that the library of units knows as something else, or not at all: there Nm is a
-#: fineness of yarn, Nms are several of it, and cfm a hundredth of a femtometre.
-_MEANT = (
-    "newton_metre = newton * metre = Nm", "newton_metre_second = newton * metre * second = Nms",
-    "newton_second = newton * second = Ns", "pascal_second = pascal * second = Pas",
-    "volt_second = volt * second = Vs", "ampere_second = ampere * second = As", "watt_second = watt * second = Ws",
-    "cubic_foot_per_minute = foot ** 3 / minute = cfm", "acidity = 1 = pH", "hundredth = 0.01 = pct",
-)  # fmt: skip
-#: A power as plain text has it: m/s2, m s-2.
-_PLAIN_POWER = re.compile(r"(?<=[A-Za-z])(-?[1-9])\b")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Unit:
-    """A unit as powers of base units and a factor to them; factor NaN where a number may have converted it."""
-
-    powers: tuple[tuple[str, float], ...]
-    factor: float
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether it has no dimension."""
-        return not self.powers
-
+from autotune.units import Unit, read_unit
 
 _ONE = Unit(powers=(), factor=1.0)
 
@@ -57,50 +25,12 @@ def _parse_unit(text: str, where: str) -> Unit:
     InputError
         A unit that is not known.
     """
-    found = _parse(text.strip())
+    found = read_unit(text)
     if found is None:
         raise InputError(
             f"the unit {text!r} is not known", where=where, remedy="write e.g. N m, kg m^2, V/s, or leave the unit out"
         )
     return found
-
-
-@lru_cache(maxsize=512)
-def _parse(text: str) -> Unit | None:
-    if text.lower() in PLAIN:
-        return Unit(powers=(), factor=0.01 if text == "%" else 1.0)
-    for given, known in _SPELT.items():
-        text = text.replace(given, known)
-    found = _base_units(text) or _base_units(_PLAIN_POWER.sub(r"^\1", text))
-    if found is None:
-        return None
-    factor, base = found
-    powers = tuple(sorted((str(n), float(p)) for n, p in base._units.items() if str(n) != "radian"))
-    return Unit(powers=tuple((n.removeprefix("delta_"), p) for n, p in powers), factor=factor)
-
-
-def _base_units(text: str) -> tuple[float, Any] | None:
-    registry = _registry()
-    try:
-        factor, base = registry.get_base_units(registry.parse_units(text, as_delta=True))
-    except Exception:  # the library has many ways to say that it does not know
-        return None
-    return float(factor), base
-
-
-@lru_cache(maxsize=1)
-def _registry() -> Any:
-    import pint
-
-    registry = pint.UnitRegistry(on_redefinition="ignore")
-    for line in _MEANT:
-        registry.define(line)
-    return registry
-
-
-def understood(text: str) -> Unit | None:
-    """Return what a unit's text means; None where it is not known."""
-    return _parse(text.strip())
 
 
 def check_units(model: EquationModel) -> None:
@@ -117,17 +47,17 @@ def check_units(model: EquationModel) -> None:
     _check_effects(model)
     if not any(given.values()) and not model.output_unit:
         return
-    known: dict[str, Unit | None] = {"pi": _ONE, "t": _parse("s")}
+    known: dict[str, Unit | None] = {"pi": _ONE, "t": read_unit("s")}
     for name, text in given.items():
         known[name] = _parse_unit(text, f"{model.name}: {name}") if text else None
     for name, tree in model.defines:
         known[name] = _Walk(known, f"{model.name}: [define] {name}").unit(tree)
-    second = _parse("s")
+    second = read_unit("s")
     assert second is not None
     for state in model.states:
         where = f"{model.name}: derivative of {state.name}"
         own = known[state.name]
-        _compare(_Walk(known, where).unit(state.derivative), None if own is None else _times(own, second, -1.0), where)
+        _compare(_Walk(known, where).unit(state.derivative), None if own is None else own.times(second, -1.0), where)
     for port in model.ports:
         if port.across is not None:
             _Walk(known, f"{model.name}: across of port {port.name}").unit(port.across)
@@ -147,33 +77,14 @@ def _compare(found: Unit | None, wanted: Unit | None, where: str) -> None:
     if found is None or wanted is None:
         return
     if found.powers != wanted.powers:
-        raise InputError(f"gives {unit_text(found)} where {unit_text(wanted)} is wanted", where=where,
+        raise InputError(f"gives {found.text} where {wanted.text} is wanted", where=where,
                          remedy="correct the expression or a unit in it")  # fmt: skip
-    if not _same_size(found, wanted):
+    if not found.is_as_large_as(wanted):
         raise InputError(
             f"gives a unit {found.factor / wanted.factor:g} times the one that is wanted",
             where=where,
             remedy="convert with a number in the expression, or use one set of units",
         )
-
-
-def _same_size(a: Unit, b: Unit) -> bool:
-    return not abs(a.factor / b.factor - 1.0) > 1e-6  # NaN: not comparable
-
-
-def _times(a: Unit, b: Unit, power: float = 1.0) -> Unit:
-    powers = dict(a.powers)
-    for name, exponent in b.powers:
-        powers[name] = powers.get(name, 0.0) + power * exponent
-    kept = tuple(sorted((n, round(p, 9)) for n, p in powers.items() if abs(p) > 1e-9))
-    return Unit(powers=kept, factor=a.factor * b.factor**power)
-
-
-def unit_text(unit: Unit) -> str:
-    """Return a unit's base units as a person writes them."""
-    short = {"meter": "m", "kilogram": "kg", "second": "s", "ampere": "A", "kelvin": "K", "mole": "mol", "gram": "g"}
-    parts = [short.get(n, n) + ("" if p == 1.0 else f"^{p:g}") for n, p in unit.powers]
-    return " ".join(parts) or "a plain number"
 
 
 class _Walk:
@@ -193,7 +104,7 @@ class _Walk:
             case Call(("*" | "/") as sign, (left, right)):
                 a, b = self.unit(left), self.unit(right)
                 zero = Number(0.0) in (left, right)
-                return None if a is None or b is None or zero else _times(a, b, 1.0 if sign == "*" else -1.0)
+                return None if a is None or b is None or zero else a.times(b, 1.0 if sign == "*" else -1.0)
             case Call(("+" | "-" | "min" | "max"), arguments):
                 return self._alike(tree, arguments)
             case Call("if", (condition, then, otherwise)):
@@ -204,7 +115,7 @@ class _Walk:
                 return self._power(base, exponent)
             case Call("sqrt", (inner,)):
                 unit = self.unit(inner)
-                return None if unit is None else _times(_ONE, unit, 0.5)
+                return None if unit is None else _ONE.times(unit, 0.5)
             case Call("sign", (inner,)):
                 self.unit(inner)
                 return _ONE
@@ -223,10 +134,10 @@ class _Walk:
             first_text, first = to_text(given[0][0]), given[0][1]
             if unit.powers != first.powers:
                 raise InputError(
-                    f"{first_text!r} is in {unit_text(first)}, {to_text(one)!r} in {unit_text(unit)}",
+                    f"{first_text!r} is in {first.text}, {to_text(one)!r} in {unit.text}",
                     where=self._where, remedy="only like units can be added or compared",
                 )  # fmt: skip
-            if not _same_size(unit, first):
+            if not unit.is_as_large_as(first):
                 raise InputError(
                     f"{first_text!r} and {to_text(one)!r} are in units that differ by a factor of "
                     f"{unit.factor / first.factor:g}",
@@ -240,7 +151,7 @@ class _Walk:
         unit = self.unit(base)
         value = _value(exponent)
         if value is not None:
-            return None if unit is None else _times(_ONE, unit, value)
+            return None if unit is None else _ONE.times(unit, value)
         self._plain(exponent, exponent)
         if unit is not None and not unit.is_plain:
             return None
@@ -252,9 +163,9 @@ class _Walk:
             return
         name = tree.function if isinstance(tree, Call) else "a power"
         if not unit.is_plain:
-            raise InputError(f"{name} of {to_text(argument)!r}, which is in {unit_text(unit)}", where=self._where,
+            raise InputError(f"{name} of {to_text(argument)!r}, which is in {unit.text}", where=self._where,
                              remedy="its argument is a plain number or an angle")  # fmt: skip
-        if name in ("sin", "cos", "tan") and not _same_size(unit, _ONE):
+        if name in ("sin", "cos", "tan") and not unit.is_as_large_as(_ONE):
             raise InputError(f"{name} of {to_text(argument)!r}, which is not in radians", where=self._where,
                              remedy="multiply by pi/180 in the expression")  # fmt: skip
 

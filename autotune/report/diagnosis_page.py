@@ -19,10 +19,11 @@ from autotune.errors import InputError
 from autotune.models import Parameter
 from autotune.report.chain_diagram import chain_diagram
 from autotune.report.diagnosis_words import answers, how_they_add_up, in_the_model, objections, places_of, verdict_of
-from autotune.report.effect_words import clause, in_short, number, of_candidates, sentence, typeset_unit, with_spread
+from autotune.report.effect_words import clause, in_short, of_candidates
 from autotune.report.law_figures import acting_figure, file_names, free_run_figure, law_figure
 from autotune.report.page import Figure, Page, Section, Table, Tone, write_page
 from autotune.report.screen_figures import curve_figure, over_time, screen_sections, trace_figures
+from autotune.report.writing import number, sentence, typeset_unit, with_spread
 
 _TONES: dict[str, Tone] = {"none": "good", "parameters": "good", "effect": "warn", "unexplained": "bad"}
 #: Rivals that are listed, and the probability below which one is none.

@@ -13,7 +13,8 @@ from autotune.diagnosis.result import Diagnosis, FoundEffect, NextExperiment
 from autotune.diagnosis.selection.probability import Candidate
 from autotune.diagnosis.verdict import OFFSET
 from autotune.effects import kind_of
-from autotune.report.effect_words import clause, in_short, join_clauses, of_candidate, sentence, unit_of, with_spread
+from autotune.report.effect_words import clause, in_short, of_candidate
+from autotune.report.writing import join_clauses, sentence, unit_of, with_spread
 
 #: Probability from which a statement is called sure, likely, and what is below that a guess.
 _SURE, _LIKELY = 0.9, 0.6

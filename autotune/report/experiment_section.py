@@ -16,9 +16,9 @@ from autotune.identification.sweep_adequacy import TESTS
 from autotune.identification.sweep_estimate import LEVEL
 from autotune.recording import Recording
 from autotune.report.chart import Chart, make_subplots
-from autotune.report.effect_words import number
 from autotune.report.figures import axis_title, recording_figure
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Section, Table, add_line, thin_curve
+from autotune.report.writing import number
 
 
 def experiment_section(

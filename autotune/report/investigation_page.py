@@ -7,8 +7,9 @@ import os
 from autotune.diagnosis.result import Diagnosis
 from autotune.pipeline.investigation import Investigation
 from autotune.report.diagnosis_page import write_diagnosis_page
-from autotune.report.effect_words import of_candidates, unit_of
+from autotune.report.effect_words import of_candidates
 from autotune.report.page import Section, Table
+from autotune.report.writing import unit_of
 
 
 def write_investigation_page(known: Investigation, found: Diagnosis, path: str | os.PathLike[str]) -> None:

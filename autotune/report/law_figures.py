@@ -15,8 +15,9 @@ from autotune.diagnosis.evidence.unseen_run import UnseenRun
 from autotune.recording import Recording
 from autotune.report import chart as go
 from autotune.report.chart import make_subplots
-from autotune.report.effect_words import clause, number, sentence, typeset_unit
+from autotune.report.effect_words import clause
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, Figure, add_line, lines_figure, thin_curve
+from autotune.report.writing import number, sentence, typeset_unit
 
 _COLOURS = {"nominal": PURPLE, "retuned": ORANGE, "extended": BLUE}
 _DASHES = {"nominal": "dot", "retuned": "dash", "extended": "solid"}

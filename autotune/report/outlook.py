@@ -20,9 +20,9 @@ from autotune.models import TransferFunction
 from autotune.pipeline import Analysis
 from autotune.pipeline.one_thread import on_one_thread
 from autotune.report.chart import Chart, make_subplots
-from autotune.report.effect_words import number
 from autotune.report.figures import axis_title, ratio_title
 from autotune.report.page import BLUE, GREY, ORANGE, Figure, Section, Table, add_line
+from autotune.report.writing import number
 
 #: Plants that are drawn from the region.
 DRAWS = 40

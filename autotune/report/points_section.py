@@ -12,7 +12,6 @@ from autotune.arrays import FloatArray
 from autotune.config.procedure import SignalSettings
 from autotune.pipeline import Analysis
 from autotune.points import FrequencyPoint
-from autotune.report.effect_words import number
 from autotune.report.figures import (
     Curve,
     bode_figure,
@@ -20,6 +19,7 @@ from autotune.report.figures import (
     gain_phase,
 )
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, Figure, Section, Table
+from autotune.report.writing import number
 
 if TYPE_CHECKING:  # a page from recordings is written without what runs a rig
     from autotune.experiment.result import ExperimentResult

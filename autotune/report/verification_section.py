@@ -10,9 +10,9 @@ from autotune.config.procedure import SignalSettings
 from autotune.experiment.judgement import Verification, smooth_steps
 from autotune.experiment.step_test import StepTest
 from autotune.report.chart import Chart, make_subplots
-from autotune.report.effect_words import sentence
 from autotune.report.figures import axis_title, ratio_title
 from autotune.report.page import BLUE, GREEN, GREY, ORANGE, RED, Figure, Section, Table, add_line, thin_curve
+from autotune.report.writing import sentence
 
 
 def verification_section(verification: Verification, signals: SignalSettings) -> Section:

@@ -16,12 +16,12 @@ from autotune.batch.settings import CampaignSettings
 from autotune.config import load_config
 from autotune.diagnosis import diagnose
 from autotune.equations.expressions import parse
-from autotune.equations.recorded_units import require_units_of_model
 from autotune.errors import InputError
 from autotune.files.workbook import open_table
 from autotune.identification.delay.tracking import track
 from autotune.models import Block, Model, Port, TransferFunction
 from autotune.pipeline.audit import audit_log
+from autotune.recorded_units import require_units_of_model
 from autotune.recording import Recording, read_recording
 from tests.autotune.command import autotune
 

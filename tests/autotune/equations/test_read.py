@@ -9,9 +9,9 @@ import pytest
 
 from autotune.equations import read_equations, write_equations
 from autotune.equations.read import equations_of
-from autotune.equations.units import understood
 from autotune.errors import InputError
 from autotune.models import Effect, Parameter
+from autotune.units import read_unit
 from tests.autotune.equations.models import PENDULUM, model
 
 
@@ -125,7 +125,7 @@ def test_a_temperature_rise_in_kelvin_and_celsius_are_alike() -> None:
      ("pct", "%"), ("m/s2", "m/s^2"), ("m s-2", "m/s^2"), ("Nm3/h", "m^3/h"), ("cfm", "ft^3/min"), ("pH", "1")],
 )  # fmt: skip
 def test_units_are_read_as_engineers_write_them(written: str, usual: str) -> None:
-    found, wanted = understood(written), understood(usual)
+    found, wanted = read_unit(written), read_unit(usual)
     assert found is not None
     assert wanted is not None
     assert found.powers == wanted.powers

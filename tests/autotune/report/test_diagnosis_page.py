@@ -23,9 +23,10 @@ from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunct
 from autotune.report.chain_diagram import chain_diagram
 from autotune.report.diagnosis_page import write_diagnosis_page
 from autotune.report.diagnosis_words import how_they_add_up
-from autotune.report.effect_words import clause, join_clauses, number, of_candidate, with_spread
+from autotune.report.effect_words import clause, of_candidate
 from autotune.report.investigation_page import list_candidates
 from autotune.report.law_figures import alike_once, file_names, style_of
+from autotune.report.writing import join_clauses, number, with_spread
 from tests.autotune.diagnosis.servo_rigs import GAIN, servo_model, servo_recording
 
 LAG = TransferFunction(num=(1.0,), den=(1.0, 1.0))

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
+from typing import Protocol
 
-from autotune.equations.black_box import BlackBox
-from autotune.equations.model import EquationModel
-from autotune.equations.units import understood
 from autotune.errors import InputError
-from autotune.models import Model
 from autotune.recording import Recording
+from autotune.units import read_unit
 
 
-def require_units_of_model(model: Model | EquationModel | BlackBox, recordings: Sequence[Recording]) -> None:
+class HasUnits(Protocol):
+    """A model of whatever form that says in which units its signals are."""
+
+    @property
+    def name(self) -> str:
+        """What it is called."""
+
+    @property
+    def signal_units(self) -> Mapping[str, str]:
+        """Unit of each column of a recording."""
+
+
+def require_units_of_model(model: HasUnits, recordings: Sequence[Recording]) -> None:
     """Refuse a model beside recordings whose columns are in other units than its signals.
 
     Parameters
     ----------
-    model : Model, EquationModel or BlackBox
+    model : HasUnits
         A chain, equations or an FMU.
     recordings : sequence of Recording
         Their sidecars' ``[units]`` are compared, column by column.
@@ -34,12 +43,8 @@ def require_units_of_model(model: Model | EquationModel | BlackBox, recordings: 
     A unit that is not given or not known contradicts nothing. Degrees Celsius and kelvin have one size, and count as
     one.
     """
-    if isinstance(model, Model):
-        units = {"u": model.input.unit, "y": model.output.unit}
-    else:
-        units = {one.column: one.unit for one in model.inputs} | {"y": model.output_unit}
     for recording in recordings:
-        _require(recording, units, f"the model {model.name!r}")
+        _require(recording, model.signal_units, f"the model {model.name!r}")
 
 
 def require_units_of_each_other(recordings: Sequence[Recording]) -> None:
@@ -64,12 +69,12 @@ def _require(recording: Recording, units: Mapping[str, str], beside: str) -> Non
         other = units.get(column, "")
         if not own or not other or own == other:
             continue
-        found, wanted = understood(own), understood(other)
+        found, wanted = read_unit(own), read_unit(other)
         if found is None or wanted is None:
             continue
         if found.powers != wanted.powers:
             how = "which do not convert"
-        elif math.isclose(found.factor, wanted.factor, rel_tol=1e-6):
+        elif found.is_as_large_as(wanted):
             continue
         else:
             how = f"a factor of {found.factor / wanted.factor:.6g}"
