@@ -175,11 +175,11 @@ def _consistent(distances: FloatArray, usual: float) -> float:
 def _caught_up(effect: SampleEffect, run: SimulatedRows) -> float:
     """Return twice the log odds that readings that come back have gone on meanwhile, as the plant did.
 
-    Without a loss they go on by what the simulation does in one row, and by no more than readings usually do: K losses
-    that leave a share q of those squared errors when the simulation's whole way is counted give -K ln q. Losses at rest
-    tell nothing.
+    Without a loss they go on by what the simulation does in one row: K losses that leave a share q of those squared
+    errors when the simulation's whole way is counted give -K ln q. Losses at rest tell nothing, and how far a reading
+    jumps tells nothing where the simulation has not gone as far: two spikes after rest jump as well.
     """
-    jumps, squares = [], []
+    squares = []
     for r, y, rows, good in zip(run.recordings, run.simulated, effect.rows, run.good, strict=True):
         usual = CAUGHT_UP * usual_change(r.y)
         for a, b in runs_of(rows):
@@ -189,12 +189,10 @@ def _caught_up(effect: SampleEffect, run: SimulatedRows) -> float:
             jump = min(r.y[b] - r.y[b - 1], r.y[b + 1] - r.y[b - 1], key=abs)
             whole = y[b] - y[a - 1]
             if abs(jump) > usual or abs(whole) > usual:
-                jumps.append(abs(jump) / usual - 1.0)
                 squares.append(((jump - (y[b] - y[b - 1])) ** 2, (jump - whole) ** 2))
     pairs = np.array(squares, dtype=np.float64).reshape(-1, 2)
-    without, beside = pairs[np.all(np.isfinite(pairs), axis=1)].sum(axis=0)
-    simulated = min(len(pairs), STRETCHES) * math.log(without / beside) if without > 0.0 and beside > 0.0 else 0.0
-    return simulated + _consistent(np.array(jumps), 1.0)
+    without, beside = np.maximum(pairs[np.all(np.isfinite(pairs), axis=1)].sum(axis=0), np.finfo(np.float64).tiny)
+    return min(len(pairs), STRETCHES) * math.log(without / beside)
 
 
 def _stand_out(effect: SampleEffect, run: SimulatedRows) -> float:

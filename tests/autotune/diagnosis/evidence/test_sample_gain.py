@@ -89,6 +89,19 @@ def test_a_plant_at_rest_behind_a_converter_loses_no_reading_and_meets_no_limit(
     assert set(named(r)) <= {"sensor.quantisation"}
 
 
+@pytest.mark.parametrize("height", [0.2, 0.4, 0.8])
+@pytest.mark.parametrize("rows", [2, 3])
+def test_spikes_of_several_rows_after_rest_are_no_lost_readings(height: float, rows: int) -> None:
+    """The reading jumps when it is back, by ten times what it usually changes; the plant has not gone anywhere."""
+    fine = recorded(lambda y: 0.02 * np.round(y / 0.02), noise=0.001, command=np.repeat([0.0, 1.0] * 6, ROWS // 12))
+    y = fine.y.copy()
+    for first in range(110, ROWS - 10, 125):
+        y[first : first + rows] += height
+    lost_readings = named(replace(fine, y=y)).get("sensor.dropout")
+    clear = 2.0 * math.log(IN_USE.decided / (1.0 - IN_USE.decided))
+    assert lost_readings is None or lost_readings.speaks < clear
+
+
 def test_spikes_that_are_small_beside_the_models_error_are_not_named() -> None:
     r = recorded(spiked)
     wrong = replace(r, u=np.cumsum(np.random.default_rng(3).normal(size=ROWS)))  # says nothing of y
