@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.errors import IdentificationError
@@ -54,36 +53,24 @@ class WholePeriods:
         return 2.0 * math.pi / self.period_s
 
 
-@njit(cache=True)
 def _switches(t: FloatArray, u: FloatArray, jump: float) -> tuple[FloatArray, BoolArray]:
     """Return instants and directions of the steps that reach 60 % of the jump within two samples."""
-    n = t.size
-    times = np.empty(n)
-    rising = np.empty(n, dtype=np.bool_)
-    count = 0
-    state = 0
-    k = 1
-    while k < n:
-        step = u[k] - u[k - 1]
-        ahead = u[k + 1] - u[k] if k + 1 < n else 0.0
-        direction = 0
-        part = 0.0  # part of the whole switch that is still missing at t[k]
-        if abs(step) >= 0.6 * jump:
-            direction = 1 if step > 0 else -1
-            if ahead * direction > 0:
-                part = ahead / (step + ahead)
-        elif abs(step + ahead) >= 0.6 * jump and step * ahead > 0:
-            direction = 1 if step > 0 else -1
-            part = ahead / (step + ahead)
-        if direction == state and count == 1:  # the first was no switch but the end of another relay's level
-            count = 0
-        if direction != 0 and (direction != state or count == 0):
-            times[count] = t[k] + part * (t[k + 1] - t[k]) if part > 0.0 else t[k]
-            rising[count] = direction > 0
-            count += 1
-            state = direction
-        k += 1
-    return times[:count], rising[:count]
+    step = np.diff(u)
+    ahead = np.append(step[1:], 0.0)
+    at_once = np.abs(step) >= 0.6 * jump
+    by_way = ~at_once & (np.abs(step + ahead) >= 0.6 * jump) & (step * ahead > 0.0)
+    rows = np.flatnonzero(at_once | by_way)
+    if not rows.size:
+        return t[:0], np.zeros(0, dtype=bool)
+    rising = step[rows] > 0.0
+    turns = np.flatnonzero(np.diff(rising)) + 1
+    # steps before the first one back are the end of another relay's level, but for the last of them
+    first = turns[0] - 1 if turns.size else rows.size - 1
+    switches = np.concatenate([[first], turns])
+    rows, rising = rows[switches], rising[switches]
+    follows = np.where(step[rows] * ahead[rows] > 0.0, ahead[rows], 0.0)
+    missing = follows / (step[rows] + follows)  # part of the whole switch that the row's own step leaves to the next
+    return t[rows + 1] + missing * (t[np.minimum(rows + 2, t.size - 1)] - t[rows + 1]), rising
 
 
 def relay_edges(t: FloatArray, u: FloatArray) -> RelayEdges:

@@ -41,78 +41,52 @@ class ReferenceModel:
         return np.asarray(self.K * np.exp(-s * self.L) / ((s + self.p) * (1.0 + s * self.tau)), dtype=np.complex128)
 
 
-@njit(cache=True)
-def _residual(
-    theta: FloatArray, prior: FloatArray, limit: FloatArray, omega: FloatArray, G: ComplexArray, weight: FloatArray
-) -> tuple[FloatArray, float]:
-    """Return weighted errors and penalties at theta = log (p, tau, L), with K at its optimum.
+#: Step of the logarithms whose differences are derivatives.
+_NUDGE = 1e-5
+
+
+def _errors(
+    thetas: FloatArray, prior: FloatArray, limit: FloatArray, omega: FloatArray, G: ComplexArray, weight: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return weighted errors and penalties at rows theta = log (p, tau, L), (k, 2H + 3), with each row's best K, (k,).
 
     The penalties are weak around the start, so that what the points leave open stays finite, and steep above the
     limits: a dead time of many periods fits the phase at a few points and nothing between them.
     """
-    p, tau, L = np.exp(theta[0]), np.exp(theta[1]), np.exp(theta[2])
-    n = omega.size
-    shape = np.empty(n, dtype=np.complex128)
-    above, below = 0.0, 0.0
-    for i in range(n):
-        s = 1j * omega[i]
-        shape[i] = np.exp(-s * L) / ((s + p) * (1.0 + s * tau))
-        above += weight[i] ** 2 * (shape[i].conjugate() * G[i]).real
-        below += weight[i] ** 2 * abs(shape[i]) ** 2
-    K = above / below
-    out = np.empty(2 * n + 3)
-    for i in range(n):
-        error = weight[i] * (K * shape[i] - G[i])
-        out[2 * i], out[2 * i + 1] = error.real, error.imag
-    for j in range(3):
-        out[2 * n + j] = (theta[j] - prior[j]) / 6.0 + 10.0 * max(theta[j] - limit[j], 0.0)
-    return out, K
-
-
-@njit(cache=True)
-def _jacobian(
-    theta: FloatArray,
-    error: FloatArray,
-    prior: FloatArray,
-    limit: FloatArray,
-    omega: FloatArray,
-    G: ComplexArray,
-    weight: FloatArray,
-) -> FloatArray:
-    """Return the derivatives of the errors at theta, by differences."""
-    out = np.empty((error.size, 3))
-    for j in range(3):
-        moved = theta.copy()
-        moved[j] += 1e-5
-        out[:, j] = (_residual(moved, prior, limit, omega, G, weight)[0] - error) / 1e-5
-    return out
+    p, tau, L = np.exp(thetas.T)[:, :, None]
+    s = 1j * omega
+    shape = weight * np.exp(-s * L) / ((s + p) * (1.0 + s * tau))
+    K = np.sum((shape.conj() * (weight * G)).real, axis=1) / np.sum(np.abs(shape) ** 2, axis=1)
+    error = K[:, None] * shape - weight * G
+    penalties = (thetas - prior) / 6.0 + 10.0 * np.maximum(thetas - limit, 0.0)
+    return np.concatenate([error.real, error.imag, penalties], axis=1), K
 
 
 def _fit(
     start: FloatArray, limit: FloatArray, omega: FloatArray, G: ComplexArray, weight: FloatArray
 ) -> tuple[FloatArray, float, float]:
     """Levenberg-Marquardt on the three logarithms; not compiled, which would take longer than all its fits."""
-    theta = start.copy()
-    error, K = _residual(theta, start, limit, omega, G, weight)
-    cost = np.dot(error, error)
-    damping = 1e-2
-    jacobian = _jacobian(theta, error, start, limit, omega, G, weight)
+
+    def at(theta: FloatArray) -> tuple[FloatArray, float, float]:
+        errors, K = _errors(theta[None], start, limit, omega, G, weight)
+        return errors[0], float(K[0]), float(errors[0] @ errors[0])
+
+    theta, damping, moved = start.copy(), 1e-2, True
+    error, K, cost = at(theta)
     for _ in range(60):
-        normal = jacobian.T @ jacobian
-        gradient = jacobian.T @ error
-        for j in range(3):
-            normal[j, j] *= 1.0 + damping
-        step = -np.linalg.solve(normal, gradient)
-        trial = theta + step
-        trial_error, trial_K = _residual(trial, start, limit, omega, G, weight)
-        trial_cost = np.dot(trial_error, trial_error)
-        if trial_cost < cost:
+        if moved:
+            beside = _errors(theta + _NUDGE * np.eye(3), start, limit, omega, G, weight)[0]
+            jacobian = (beside - error).T / _NUDGE
+            normal, gradient = jacobian.T @ jacobian, jacobian.T @ error
+        trial = theta - np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
+        trial_error, trial_K, trial_cost = at(trial)
+        moved = trial_cost < cost
+        if moved:
             done = cost - trial_cost < 1e-10 * cost
             theta, error, K, cost = trial, trial_error, trial_K, trial_cost
             damping = max(damping * 0.2, 1e-9)
             if done:
                 break
-            jacobian = _jacobian(theta, error, start, limit, omega, G, weight)
         else:
             damping *= 5.0
             if damping > 1e9:
