@@ -19,6 +19,7 @@ _MEANT = (
     "volt_second = volt * second = Vs", "ampere_second = ampere * second = As", "watt_second = watt * second = Ws",
     "cubic_foot_per_minute = foot ** 3 / minute = cfm", "acidity = 1 = pH", "hundredth = 0.01 = pct",
 )  # fmt: skip
+#: Base units as a person writes them.
 _SHORT = {"meter": "m", "kilogram": "kg", "second": "s", "ampere": "A", "kelvin": "K", "mole": "mol", "gram": "g"}
 #: A power as plain text has it: m/s2, m s-2.
 _PLAIN_POWER = re.compile(r"(?<=[A-Za-z])(-?[1-9])\b")
@@ -39,16 +40,7 @@ class Unit:
     @property
     def text(self) -> str:
         """Its base units as a person writes them."""
-        short = {
-            "meter": "m",
-            "kilogram": "kg",
-            "second": "s",
-            "ampere": "A",
-            "kelvin": "K",
-            "mole": "mol",
-            "gram": "g",
-        }
-        parts = [short.get(n, n) + ("" if p == 1.0 else f"^{p:g}") for n, p in self.powers]
+        parts = [_SHORT.get(n, n) + ("" if p == 1.0 else f"^{p:g}") for n, p in self.powers]
         return " ".join(parts) or "a plain number"
 
     def is_as_large_as(self, other: Unit) -> bool:

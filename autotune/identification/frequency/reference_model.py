@@ -15,6 +15,9 @@ from numba import njit
 
 from autotune.arrays import ComplexArray, FloatArray
 
+#: Step of the logarithms whose differences are derivatives.
+_NUDGE = 1e-5
+
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceModel:
@@ -39,10 +42,6 @@ class ReferenceModel:
         """Return the complex gain at the angular frequencies."""
         s = 1j * np.asarray(omega_rad_s, dtype=np.float64)
         return np.asarray(self.K * np.exp(-s * self.L) / ((s + self.p) * (1.0 + s * self.tau)), dtype=np.complex128)
-
-
-#: Step of the logarithms whose differences are derivatives.
-_NUDGE = 1e-5
 
 
 def _errors(
