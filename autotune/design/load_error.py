@@ -22,6 +22,7 @@ from autotune.design.simplex import search_by_simplex
 _PER_CROSSOVER = 0.08  # radians of the crossover per step of time
 _LEAST, _MOST = 1 << 10, 1 << 16
 _WALL = 300.0  # cost of a constraint violated by all of it, in logarithms of the error
+#: sizes of the simplexes, in logarithms of the gains; of two gains the first pair ends where the others do, to 1e-7
 _SPANS = (0.3, 0.1, 0.03)
 _NEAR = 0.05  # how far the last search may go, in logarithms of the gains
 
@@ -122,7 +123,7 @@ def least_error(load: LoadStep, slacks: Callable[[FloatArray], FloatArray], star
         return error - _WALL * min(least, 0.0) + (10.0 if least <= -1.0 else 0.0)
 
     inside = np.log([0.85, 0.75, 1.0, 1.0])[free]  # off the corner of two constraints, where a simplex would stay
-    for span in _SPANS:
+    for span in _SPANS if size > 2 else _SPANS[:1]:
         for direction in (1.0, -1.0):
             at = np.log(seen.best[free] / start[free]) + (inside if span == _SPANS[0] else 0.0)
             vertices = np.vstack((at, at + direction * span * (np.eye(size) - 0.5 / size)))

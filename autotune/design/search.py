@@ -237,23 +237,19 @@ def _local_search(problem: Problem, start: FloatArray, offset: FloatArray) -> tu
     free = start > 0.0
     specification = problem.specification
     asked = [0, 1, 2, 3] if specification.delay_margin_s > 0.0 else [0, 1, 2]
-    memory: dict[bytes, tuple[float, FloatArray]] = {}
     best: tuple[float, FloatArray] = (math.inf, start)
 
     def look(x: FloatArray) -> tuple[float, FloatArray]:
         nonlocal best
-        key = x.tobytes()
-        if key not in memory:
-            p = start.copy()
-            p[free] = start[free] * np.exp(x)
-            found = problem.figures_at(p)
-            slack = np.array([problem.slacks_of(i, figures) for i, figures in enumerate(found)]) - offset
-            slack = np.minimum(slack[:, asked], MOST_SLACK).ravel()
-            squared = float(found[0].squared_norm)
-            memory[key] = (0.5 * math.log(squared), slack)
-            if np.min(slack) >= -1e-9 and squared < best[0]:
-                best = (squared, p)
-        return memory[key]
+        p = start.copy()
+        p[free] = start[free] * np.exp(x)
+        found = problem.figures_at(p)
+        slack = np.array([problem.slacks_of(i, figures) for i, figures in enumerate(found)]) - offset
+        slack = np.minimum(slack[:, asked], MOST_SLACK).ravel()
+        squared = float(found[0].squared_norm)
+        if np.min(slack) >= -1e-9 and squared < best[0]:
+            best = (squared, p)
+        return 0.5 * math.log(squared), slack
 
     x = np.zeros(int(np.sum(free)))
     for span in (1.0, 0.05):
@@ -285,15 +281,24 @@ def minimise(
     tolerance : float
         Of the value.
     """
+    seen: dict[bytes, tuple[float, FloatArray]] = {}
+
+    def look_once(z: FloatArray) -> tuple[float, FloatArray]:
+        # value, slacks and the gradients of both are asked for apart, at the same points
+        key = z.tobytes()
+        if key not in seen:
+            seen[key] = look(z)
+        return seen[key]
+
     # the stubs know no inequality constraint with its own gradient
     result = minimize(  # type: ignore[call-overload] # see above
-        lambda z: look(z)[0],
+        lambda z: look_once(z)[0],
         start,
-        jac=lambda z: _gradient(lambda v: np.array([look(v)[0]]), z)[0],
+        jac=lambda z: _gradient(lambda v: np.array([look_once(v)[0]]), z)[0],
         constraints={
             "type": "ineq",
-            "fun": lambda z: look(z)[1],
-            "jac": lambda z: _gradient(lambda v: look(v)[1], z),
+            "fun": lambda z: look_once(z)[1],
+            "jac": lambda z: _gradient(lambda v: look_once(v)[1], z),
         },
         bounds=[(float(value) - span, float(value) + span) for value in start],
         method="SLSQP",
