@@ -119,17 +119,19 @@ class Judged(ABC):
         """Return twice the logarithm of the odds that another hypothesis is the better one, priors counted.
 
         Where both leave noise that is what rows say. Where neither does, the model's error decides, and it is what
-        stretches say that were left out. Where one does, rows may speak for it, but not against it: what leaves more
-        than noise, or foretells nothing, is no better for what it makes of the rows that it was fitted to.
+        stretches say that were left out. Where one does, rows may speak for it as far as those that were left out do,
+        and not against it: start states that are free make noise of much in the rows that they were fitted to, and what
+        leaves more than noise is no better for what it makes of those.
         """
         prior = 2.0 * (self.log_odds - other.log_odds)
         if self.leaves_noise and other.leaves_noise:
             return self._by_rows(other) - prior
+        stretches = self._by_stretches(other)
         if other.leaves_noise:
-            return max(self._by_rows(other), self._by_stretches(other)) - prior
+            return max(min(self._by_rows(other), self._by_rows_left_out(other)), stretches) - prior
         if self.leaves_noise:
-            return min(self._by_rows(other), self._by_stretches(other)) - prior
-        return self._by_stretches(other) - prior
+            return min(max(self._by_rows(other), self._by_rows_left_out(other)), stretches) - prior
+        return stretches - prior
 
     def _by_rows(self, other: Judged) -> float:
         """Return what the innovations of all rows say for another hypothesis: Schwarz's criterion, cooled.
@@ -139,6 +141,10 @@ class Judged(ABC):
         said = self.rows * math.log(self.variance / other.variance)
         said += (self.numbers - other.numbers) * math.log(self.rows)
         return said / self.limits.temperature
+
+    def _by_rows_left_out(self, other: Judged) -> float:
+        """Return what left-out rows say for another hypothesis, cooled, each an independent witness of noise."""
+        return self.rows * (self.log_squares - other.log_squares) / self.limits.temperature
 
     def _by_stretches(self, other: Judged) -> float:
         """Return what stretches that were left out say for another hypothesis, cooled as rows are.

@@ -57,6 +57,31 @@ def test_what_beats_one_that_beats_another_beats_that_in_any_unit(
     assert scaled[0].behind(scaled[1]) == pytest.approx(first.behind(second), rel=1e-9, abs=1e-9)
 
 
+class Quiet(Astray):
+    """A hypothesis that leaves noise."""
+
+    leaves_noise = True
+
+
+@given(SIZES, SIZES, st.floats(0.1, 10.0), st.floats(0.1, 10.0), st.integers(100, 10_000))
+def test_rows_that_were_fitted_speak_for_what_leaves_noise_as_far_as_left_out_rows_do(
+    quiet_error: float, loud_error: float, quiet_variance: float, loud_variance: float, rows: int
+) -> None:
+    """In windows of some rows, start states that are free make noise of what a wrong effect leaves."""
+    quiet = Quiet(names=(DRY,), log_odds=0.0, long_squares=(quiet_error * ERRORS) ** 2, short_squares=np.ones(8))
+    loud = Astray(names=(), log_odds=0.0, long_squares=(loud_error * ERRORS) ** 2, short_squares=np.ones(8))
+    for one, variance in ((quiet, quiet_variance), (loud, loud_variance)):
+        one.__dict__.update(variance=variance, rows=rows)
+    said = loud.behind(quiet)
+    assert said == pytest.approx(-quiet.behind(loud), abs=1e-9)
+    if quiet_error >= loud_error:
+        assert said <= 0.0
+    else:
+        per_row = min(math.log(loud_variance / quiet_variance), math.log(loud_error / quiet_error))
+        stretches = STRETCHES * math.log(loud_error / quiet_error) / IN_USE.temperature
+        assert said == pytest.approx(max(rows * per_row / IN_USE.temperature, stretches), abs=1e-6)
+
+
 def test_what_is_rare_needs_more_evidence_than_what_is_usual() -> None:
     rare = hypothesis_of((CURVED,), 0.66, math.log(0.01))
     usual = hypothesis_of((DRY,), 0.7, math.log(0.5))
