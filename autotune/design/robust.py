@@ -203,20 +203,16 @@ def _quadratic(
 ) -> FloatArray:
     """Return the best controller that sequential quadratic programming in log gains looked at, or else ``start``."""
     free = start > 0.0
-    memory: dict[bytes, tuple[float, FloatArray]] = {}
     best: tuple[float, FloatArray] = (math.inf, start)
 
     def look(x: FloatArray) -> tuple[float, FloatArray]:
         nonlocal best
-        key = x.tobytes()
-        if key not in memory:
-            p = start.copy()
-            p[free] = start[free] * np.exp(x)
-            norm, slacks = _norm(plant, p), _slacks(plant, specification, p)
-            if np.min(slacks) >= 0.0 and norm < best[0]:
-                best = (norm, p)
-            memory[key] = (norm, slacks - 1e-7)
-        return memory[key]
+        p = start.copy()
+        p[free] = start[free] * np.exp(x)
+        norm, slacks = _norm(plant, p), _slacks(plant, specification, p)
+        if np.min(slacks) >= 0.0 and norm < best[0]:
+            best = (norm, p)
+        return norm, slacks - 1e-7
 
     x = np.zeros(int(np.sum(free)))
     for span in spans:

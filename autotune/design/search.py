@@ -271,7 +271,7 @@ def minimise(
     Parameters
     ----------
     look : callable
-        From (P,) parameters to what is minimised and its (S,) slacks, negative where violated; remembers what it saw.
+        From (P,) parameters to what is minimised and its (S,) slacks, negative where violated; asked once at each.
     start : (P,) array
         Where it begins.
     span : float
