@@ -339,6 +339,7 @@ def test_regions_of_a_window_hold_the_truth_whether_or_not_three_terms_follow_it
     assert 0.93 <= np.mean(inside) <= 0.98
 
 
+@pytest.mark.timeout(900)  # 400 records take a busy computer five minutes, and a share of fewer says less
 def test_regions_hold_the_truth_under_autoregressive_noise_where_a_rough_model_follows_it() -> None:
     """Two lags, 400 records: .925 where noise is taken for equally large on all lines of a window."""
     shares = [float(by_points(600)(seed, 0.9)[0]) for seed in range(400)]
