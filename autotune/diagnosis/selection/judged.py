@@ -126,11 +126,11 @@ class Judged(ABC):
         prior = 2.0 * (self.log_odds - other.log_odds)
         if self.leaves_noise and other.leaves_noise:
             return self._by_rows(other) - prior
-        stretches = self._by_stretches(other)
+        stretches = self._by_left_out(other, STRETCHES)
         if other.leaves_noise:
-            return max(min(self._by_rows(other), self._by_rows_left_out(other)), stretches) - prior
+            return max(min(self._by_rows(other), self._by_left_out(other, self.rows)), stretches) - prior
         if self.leaves_noise:
-            return min(max(self._by_rows(other), self._by_rows_left_out(other)), stretches) - prior
+            return min(max(self._by_rows(other), self._by_left_out(other, self.rows)), stretches) - prior
         return stretches - prior
 
     def _by_rows(self, other: Judged) -> float:
@@ -142,19 +142,15 @@ class Judged(ABC):
         said += (self.numbers - other.numbers) * math.log(self.rows)
         return said / self.limits.temperature
 
-    def _by_rows_left_out(self, other: Judged) -> float:
-        """Return what left-out rows say for another hypothesis, cooled, each an independent witness of noise."""
-        return self.rows * (self.log_squares - other.log_squares) / self.limits.temperature
-
-    def _by_stretches(self, other: Judged) -> float:
-        """Return what stretches that were left out say for another hypothesis, cooled as rows are.
+    def _by_left_out(self, other: Judged, witnesses: int) -> float:
+        """Return what left-out stretches, or rows of them, say for another hypothesis, cooled as fitted rows are.
 
         A stretch is one witness of the model's own error, as a row is of noise: errors that are normal, independent
         from stretch to stretch and of a size that each stretch has for itself give K times the mean of ln(S1/S2) for
         the squared errors S on K stretches. Long windows and short ones are two measurements of the same, and count as
         their mean.
         """
-        return STRETCHES * (self.log_squares - other.log_squares) / self.limits.temperature
+        return witnesses * (self.log_squares - other.log_squares) / self.limits.temperature
 
     def is_better(self, other: Judged) -> bool:
         """Whether it takes what matters of another one's held-out error away; near the noise, what rows speak for."""
