@@ -136,7 +136,8 @@ def values_of(effect: Effect, model: Model) -> dict[str, float]:
 def _require_possible(kind: EffectKind, values: Mapping[str, float], model: Model) -> None:
     """Refuse values that an effect cannot take."""
     for q in kind.parameters:
-        if q.nonzero and not values[q.name] > 0.0:
+        # of one tank alone the second one's level is not given, and its neutral value is 0
+        if q.nonzero and values[q.name] != q.neutral and not values[q.name] > 0.0:
             what = f"{kind.name} has {q.name} = {values[q.name]:g}"
             raise InputError(what, where=model.name, remedy="give it a value above zero")
     wrong = kind.possible(values, model) if kind.possible is not None else ""

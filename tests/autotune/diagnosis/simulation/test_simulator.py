@@ -235,3 +235,32 @@ def test_a_block_that_an_effect_adds_begins_at_rest_beside_the_others(name: str,
     more = part.start(np.array([1.0]), np.array([small.taps[3] @ x]), added.values)[0]
     x = np.concatenate([more, x] if part.at == "front" else [x, more])
     np.testing.assert_allclose(large.A @ x + large.B[:, 0], 0.0, atol=1e-9 * np.abs(large.A).max() * np.abs(x).max())
+
+
+def tank(effects: tuple[Effect, ...] = ()) -> Model:
+    block = Block(
+        name="tank", place="plant", output="level", dynamics=TransferFunction(num=(5.3,), den=(82.0, 1.0)), unit="cm"
+    )
+    return Model(
+        name="tank", input=Port(unit="V"), output=Port(unit="cm", offset=9.7), blocks=(block,), effects=effects
+    )
+
+
+def test_the_root_of_a_tanks_level_falls_evenly_once_its_inflow_is_shut() -> None:
+    # Torricelli: T dx/dt = K w - 2 X0 (sqrt(1 + x/X0) - 1), and K w = -2 X0 leaves d sqrt(1 + x/X0)/dt = -1/T
+    level_cm, dt = 9.7, 0.5
+    sim = assemble(tank((effect("plant.sqrt_outflow", operating_level=level_cm),)))
+    shut = recording(np.full(100, -2.0 * level_cm / 5.3), dt)
+    got = sim.run(shut, np.zeros(sim.order), signals=1)[0][:, 0]
+    assert np.allclose(np.sqrt(got / level_cm), 1.0 - shut.t / 82.0, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if kind.is_simulated and kind.possible is None])
+def test_an_effect_runs_with_nothing_but_what_has_no_neutral_value(name: str) -> None:
+    kind = KINDS[name]
+    given = {q.name: 1.0 for q in kind.parameters if q.neutral is None} or {kind.parameters[0].name: 1.0}
+    able = [model for model in (tank(), servo()) if kind.needs.holds(assemble(model).chain)]
+    assert able
+    for model in able:
+        sim = assemble(replace(model, effects=(effect(name, **given),)))
+        assert np.isfinite(sim.run(recording(np.ones(20), 0.1), np.zeros(sim.order))[0]).all()
