@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from autotune.arrays import is_constant
 from autotune.batch.operation import look_in_operation, row_of
@@ -32,6 +31,7 @@ from autotune.identification.frequency.recorded import combine, frequency_points
 from autotune.identification.frequency.spectral_points import FrequencyEstimate
 from autotune.identification.parametric import PlantFit
 from autotune.model_file import read_model
+from autotune.one_thread import on_one_thread
 from autotune.pipeline import Analysis, Measured, analyse, analysis_json, measure_plant
 from autotune.points import FrequencyPoint, points_to_json
 from autotune.recorded_units import require_units_of_model
@@ -106,8 +106,7 @@ def analyse_loop(work: Work) -> Finding:
     loop = work.loop
     row = Row(loop=loop.name, attention="fine", area=loop.area, file=loop.file, u_unit=loop.u_unit, y_unit=loop.y_unit)
     try:
-        with threadpool_limits(1):
-            return _finding(work, row)
+        return _finding(work, row)
     except AutotuneError as error:
         return Finding(row=replace(row, attention="failed", reason=str(error)))
     except OSError:
@@ -118,6 +117,7 @@ def analyse_loop(work: Work) -> Finding:
         return Finding(row=replace(row, attention="failed", reason=reason))
 
 
+@on_one_thread
 def _finding(work: Work, row: Row) -> Finding:
     loop, settings = work.loop, work.settings
     present = _present(loop)

@@ -23,6 +23,7 @@ from autotune.equations.files import AnyModel
 from autotune.errors import InputError
 from autotune.identification.answer import require_two_signals
 from autotune.models import Model
+from autotune.one_thread import on_one_thread
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
 
@@ -38,6 +39,7 @@ WITHHELD = tuple(
 WHOLE = 0.6
 
 
+@on_one_thread
 def diagnose(
     model: AnyModel,
     recordings: Sequence[Recording],

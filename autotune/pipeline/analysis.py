@@ -26,7 +26,7 @@ from autotune.errors import AutotuneError, DesignError
 from autotune.identification.consistent_structures import consistent_structures
 from autotune.identification.parametric import PlantFit, fit_plant
 from autotune.identification.reduction import ReducedModel, reduce_points
-from autotune.pipeline.one_thread import on_one_thread
+from autotune.one_thread import on_one_thread
 from autotune.points import FrequencyPoint, as_pairs
 from autotune.progress import Progress, quiet
 

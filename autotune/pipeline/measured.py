@@ -15,7 +15,7 @@ from autotune.identification.frequency.spectral_points import FrequencyEstimate
 from autotune.identification.frequency.windows import read_noted_windows
 from autotune.identification.parametric import LEAST_POINTS, PlantFit
 from autotune.identification.recorded_plant import fit_recordings
-from autotune.pipeline.one_thread import on_one_thread
+from autotune.one_thread import on_one_thread
 from autotune.points import FrequencyPoint
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording

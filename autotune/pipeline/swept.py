@@ -19,8 +19,8 @@ from autotune.experiment.together import Price
 from autotune.identification.parametric import PlantFit
 from autotune.identification.recorded_plant import fit_recordings
 from autotune.identification.sweep_estimate import SweepEstimate
+from autotune.one_thread import on_one_thread
 from autotune.pipeline.analysis import Analysis, analyse, specification
-from autotune.pipeline.one_thread import on_one_thread
 from autotune.recording import Recording, read_recording
 
 Tell = Callable[[str], None]

@@ -17,8 +17,8 @@ from autotune.design.synthesis import design
 from autotune.errors import AutotuneError
 from autotune.experiment.prediction import Prediction, predict
 from autotune.models import TransferFunction
+from autotune.one_thread import on_one_thread
 from autotune.pipeline import Analysis
-from autotune.pipeline.one_thread import on_one_thread
 from autotune.report.chart import Chart, make_subplots
 from autotune.report.figures import axis_title, ratio_title
 from autotune.report.page import BLUE, GREY, ORANGE, Figure, Section, Table, add_line

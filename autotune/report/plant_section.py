@@ -10,7 +10,7 @@ import numpy as np
 from autotune.config.procedure import SignalSettings
 from autotune.identification.parametric import PlantFit
 from autotune.models import TransferFunction
-from autotune.pipeline.one_thread import on_one_thread
+from autotune.one_thread import on_one_thread
 from autotune.recording import Recording
 from autotune.report.chart import Chart
 from autotune.report.figures import ratio_title, recording_figure

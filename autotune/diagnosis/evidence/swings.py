@@ -9,7 +9,6 @@ from functools import partial, reduce
 
 import numpy as np
 from numba import njit
-from threadpoolctl import threadpool_limits
 
 from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.evidence.residual import NEW, FreedResidual
@@ -80,7 +79,7 @@ def explained_by_swings(left: FreedResidual, e: FloatArray, swinging: Sequence[S
         return reduce(_added, found)
 
     decreases = []
-    with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
+    with ThreadPoolExecutor(2) as pool:
         for cycles in np.array_split(np.arange(count + 1.0), pieces):
             one = partial(summed, frequencies=per_cycle * cycles)
             parts = pool.map(one, range(min(PARTS, len(windows))))

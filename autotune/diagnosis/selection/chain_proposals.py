@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.operating_point import unmoved
@@ -73,7 +72,7 @@ def search_chain(
     AutotuneError, OverflowError, LinAlgError
         The nominal model runs away on the recordings.
     """
-    with threadpool_limits(1), ThreadPoolExecutor(2) as pool:
+    with ThreadPoolExecutor(2) as pool:
         progress("retuning on long windows", 0.0)
         lengths = lengths_of(model, recordings, limits)
         bench = Bench(

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from autotune.arrays import ComplexArray, FloatArray, is_constant
 from autotune.controller import Controller
@@ -32,6 +31,7 @@ from autotune.identification.closed_loop.prediction_error import PredictionError
 from autotune.identification.closed_loop.series import Series
 from autotune.identification.closed_loop.structures import Structures, Weighted
 from autotune.identification.closed_loop.subspace_direct import lagged_data
+from autotune.one_thread import on_one_thread
 from autotune.points import FrequencyPoint
 from autotune.progress import Progress, quiet
 from autotune.recording import Recording
@@ -96,6 +96,7 @@ class ClosedLoopIdentification:
         return self.structures.chosen
 
 
+@on_one_thread
 def identify_closed_loop(
     recording: Recording,
     *,
@@ -157,18 +158,17 @@ def identify_closed_loop(
     law = _check_law(longest, controller, r is not None, warnings)
     scale_u, scale_y = float(np.std(u)), float(np.std(y))
     u_1, y_1 = ((u - u.mean()) / scale_u)[:, None], ((y - y.mean()) / scale_y)[:, None]
-    with threadpool_limits(1):  # threads spin longer on these small matrices than they work
-        motion = _look(u_1, y_1, r, starts, recording.name)
-        estimate, others, evidence = _fit(u_1, y_1, starts, order, delay, max_order, progress)
-        white = whiteness(estimate, residuals(estimate, u_1, y_1, starts))
-        found = Structures(
-            chosen=_in_units(estimate, scale_u, scale_y, dt_s),
-            others=tuple((weight, _in_units(one, scale_u, scale_y, dt_s)) for weight, one in others),
-        )
-        omega = _grid(dt_s, len(y)) if omega_rad_s is None else _below_nyquist(omega_rad_s, dt_s)
-        result = _report(found, omega, law, motion, white)
-        if not result.excitation.enough:
-            result = replace(result, proposal=_proposal(result, limits or _recorded_limits(u, y)))
+    motion = _look(u_1, y_1, r, starts, recording.name)
+    estimate, others, evidence = _fit(u_1, y_1, starts, order, delay, max_order, progress)
+    white = whiteness(estimate, residuals(estimate, u_1, y_1, starts))
+    found = Structures(
+        chosen=_in_units(estimate, scale_u, scale_y, dt_s),
+        others=tuple((weight, _in_units(one, scale_u, scale_y, dt_s)) for weight, one in others),
+    )
+    omega = _grid(dt_s, len(y)) if omega_rad_s is None else _below_nyquist(omega_rad_s, dt_s)
+    result = _report(found, omega, law, motion, white)
+    if not result.excitation.enough:
+        result = replace(result, proposal=_proposal(result, limits or _recorded_limits(u, y)))
     _further_warnings(result, evidence, r, warnings)
     return replace(result, evidence=evidence, warnings=tuple(warnings))
 

@@ -20,12 +20,12 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import LinAlgError
-from threadpoolctl import threadpool_limits
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import IdentificationError, InputError
 from autotune.identification.delay.modulated_integrals import Interval
 from autotune.identification.delay.weighted_equations import Windows, minimise_weighted
+from autotune.one_thread import on_one_thread
 from autotune.recording import Recording
 
 #: Samples of an interval in the polish, and harmonics of its length that modulate it besides.
@@ -220,12 +220,12 @@ def _iterate(
     )  # fmt: skip
 
 
+@on_one_thread
 def _polish(recording: Recording, starts: FloatArray, L: float, start: TwoDelays) -> TwoDelays:
     """Return the minimum of the weighted equations, y being the output with white noise."""
     try:
         equations = _Equations.of(recording, Windows(starts, L, _HARMONICS), start.values)
-        with threadpool_limits(1):
-            found = minimise_weighted(equations, start.values)
+        found = minimise_weighted(equations, start.values)
     except LinAlgError:
         found = None
     if found is None or not np.all(np.isfinite(found.covariance)) or found.condition > _DETERMINED:

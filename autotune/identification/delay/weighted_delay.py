@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import LinAlgError, eigh
-from threadpoolctl import threadpool_limits
 
 from autotune.arrays import ComplexArray, FloatArray
 from autotune.errors import IdentificationError
@@ -21,6 +20,7 @@ from autotune.identification.delay.output_error import Structure, residuals, sol
 from autotune.identification.delay.output_error_model import colour_of
 from autotune.identification.delay.weighted_equations import Weighted, Windows, minimise_weighted
 from autotune.identification.noise_colour import NoiseColour
+from autotune.one_thread import on_one_thread
 
 #: Largest harmonic of a window, intervals per length, and most intervals, which are then spaced out over the record.
 _HARMONICS, _OVERLAP, _MOST = 4, 3, 60
@@ -132,6 +132,7 @@ def _of_output(t: FloatArray, y: FloatArray, order: int, windows: Windows) -> Fl
     return np.column_stack([(-1.0) ** i * windows.of_signal(t, running, 0.0, i) for i in range(order + 1)])
 
 
+@on_one_thread
 def weighted_delay(
     data: DelayData, order: int, length_s: float, *, start_s: float | None = None
 ) -> tuple[FloatArray, FloatArray]:
@@ -158,11 +159,6 @@ def weighted_delay(
     IdentificationError
         The equations do not determine a, b and h.
     """
-    with threadpool_limits(1):  # threads spin longer on these small matrices than they work
-        return _fit_weighted(data, order, length_s, start_s)
-
-
-def _fit_weighted(data: DelayData, order: int, length_s: float, start_s: float | None) -> tuple[FloatArray, FloatArray]:
     largest = max(0.5 * (data.duration_s - length_s), 0.0)
     grid = np.arange(0.0, largest + 1e-12, length_s / (_HARMONICS + 2) / _GRID)
     found: list[tuple[float, FloatArray]] = []
