@@ -44,8 +44,8 @@ ASTRAY = 0.9
 #: What is said where effects were found that follow y whatever the command does, as a slow lag follows any walk.
 UNHEEDED = (
     "Nothing is said of what is missing: on rows that were left out, what explains y best errs as much with commands "
-    "that stand still there. Look whether the columns are u and y of this model, and record again with commands that "
-    "move y."
+    "that stand still there. Record again with commands that move y by more than it moves by itself; if they did, look "
+    "whether the columns are u and y of this model."
 )
 #: What is said where effects were found in a loop that its own noise drives, with a model that is not of its plant.
 UNDISTURBED = (
