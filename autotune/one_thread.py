@@ -1,4 +1,7 @@
-"""Linear algebra on one core: several add up in another order, and a search takes the last digit to the fourth."""
+"""Linear algebra on one core: several add up in another order, and a search takes the last digit to the fourth.
+
+Threads also spin longer on small matrices than they work.
+"""
 
 from __future__ import annotations
 

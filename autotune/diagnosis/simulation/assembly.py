@@ -73,7 +73,7 @@ def assemble_at(
         if kind in kinds:
             raise InputError(f"{kind.name} stands twice", where=model.name, remedy="leave one of the two out")
         kinds.append(kind)
-        _require_possible(kind, given, model)
+        _require_possible(effect, given, model)
         if kind.lines:
             acts[known.flag(kind.name)] = 1
             for q in kind.parameters:
@@ -133,11 +133,11 @@ def values_of(effect: Effect, model: Model) -> dict[str, float]:
     return values
 
 
-def _require_possible(kind: EffectKind, values: Mapping[str, float], model: Model) -> None:
-    """Refuse values that an effect cannot take."""
+def _require_possible(effect: Effect, values: Mapping[str, float], model: Model) -> None:
+    """Refuse values that an effect cannot take; what is not given has its neutral one, and may be 0."""
+    kind = KINDS[effect.name]
     for q in kind.parameters:
-        # of one tank alone the second one's level is not given, and its neutral value is 0
-        if q.nonzero and values[q.name] != q.neutral and not values[q.name] > 0.0:
+        if q.nonzero and q.name in effect.parameters and not values[q.name] > 0.0:
             what = f"{kind.name} has {q.name} = {values[q.name]:g}"
             raise InputError(what, where=model.name, remedy="give it a value above zero")
     wrong = kind.possible(values, model) if kind.possible is not None else ""

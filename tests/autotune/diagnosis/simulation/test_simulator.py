@@ -255,6 +255,11 @@ def test_the_root_of_a_tanks_level_falls_evenly_once_its_inflow_is_shut() -> Non
     assert np.allclose(np.sqrt(got / level_cm), 1.0 - shut.t / 82.0, atol=1e-4)
 
 
+def test_a_second_tanks_level_that_is_given_is_above_zero() -> None:
+    with pytest.raises(InputError, match="operating_level_2 = 0"):
+        assemble(tank((effect("plant.sqrt_outflow", operating_level=9.7, operating_level_2=0.0),)))
+
+
 @pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if kind.is_simulated and kind.possible is None])
 def test_an_effect_runs_with_nothing_but_what_has_no_neutral_value(name: str) -> None:
     kind = KINDS[name]
