@@ -142,13 +142,13 @@ class Fit:
 def start_states(sim: Simulator, data: Data) -> list[FloatArray]:
     """Return a first guess of every window's start state: rest at the row's command and reading."""
     result = []
-    rows = zip(data.recordings, data.good, data.starts, data.driving, data.first_rows, strict=True)
-    for recording, good, starts, driving, first in rows:
+    rows = zip(data.recordings, data.good, data.starts, data.driving, data.first_rows, data.sample_times, strict=True)
+    for recording, good, starts, driving, first, dt in rows:
         y = np.empty(starts.size)
         for k, s in enumerate(starts):
             near = good[s : s + 20]
             y[k] = recording.y[s + int(near.argmax())] if near.any() else float(np.mean(recording.y[good]))
-        result.append(sim.rest_states(driving.u[np.maximum(first - 1, 0)], y))
+        result.append(sim.rest_states(driving.u[np.maximum(first - 1, 0)], y, dt))
     return result
 
 
@@ -226,7 +226,7 @@ def fit(
     point = parametrisation.centre.copy() if theta is None else theta.copy()
     problem = Problem(parametrisation, data)
     sim = parametrisation.simulator(point)
-    problem.scales = sim.state_sizes(*data.spans)
+    problem.scales = data.state_sizes(sim)
     fits_in = x0 is not None and x0[0].shape[1] == sim.order
     states = [x.copy() for x in x0] if x0 is not None and fits_in else start_states(sim, data)
     may = np.ones(point.size, dtype=bool) if free is None else free

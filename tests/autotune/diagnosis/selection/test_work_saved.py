@@ -68,10 +68,10 @@ def test_states_at_rest_are_found_for_all_windows_as_for_each(seed: int, stiffne
         Model(name="m", input=Port(), output=Port(), blocks=(Block(name="b", place="plant", dynamics=dynamics),))
     )
     u, y = random.normal(size=(2, 7))
-    together = sim.rest_states(u, y)
+    together = sim.rest_states(u, y, 0.1)
     assert together.shape == (7, 2)
     for one, command, reading in zip(together, u, y, strict=True):
-        assert one == pytest.approx(sim.rest_state(command, reading), rel=1e-9, abs=1e-12)
+        assert one == pytest.approx(sim.rest_state(command, reading, 0.1), rel=1e-9, abs=1e-12)
 
 
 def test_tasks_side_by_side_keep_their_order() -> None:
