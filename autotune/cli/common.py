@@ -1,10 +1,10 @@
-"""What several commands share: the rig of a configuration, a new folder for its files, a progress bar."""
+"""What several commands share: options, the rig of a configuration, a new folder for its files, a progress bar."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -17,6 +17,24 @@ if TYPE_CHECKING:
     from autotune.config import Config
     from autotune.experiment.result import Status
     from autotune.experiment.rig import Rig
+
+# Arguments and options of several commands, in the same words.
+CONFIG = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configuration of the rig")]
+OVERWRITE = Annotated[bool, typer.Option("--overwrite", help="replace what is at --out; an input never is")]
+DRY_RUN = Annotated[bool, typer.Option("--dry-run", help="run the rig's simulated twin instead of the rig")]
+WITHOUT = Annotated[
+    list[str] | None, typer.Option(help="leave an effect out of the catalogue; may be given several times")
+]
+INTEGRATOR = Annotated[bool, typer.Option("--integrator", help="the plant integrates: a0 = 0")]
+STRUCTURE = Annotated[Literal["pi", "pid"], typer.Option(help="structure of the controller")]
+NOISE_FREQUENCY = Annotated[
+    float | None, typer.Option(help="lowest frequency of the noise [rad/s]; default the crossover")
+]
+U_SPAN = Annotated[float, typer.Option(help="engineering span of the output, for percent forms [u unit]")]
+Y_SPAN = Annotated[float, typer.Option(help="engineering span of the measurement [y unit]")]
+SCHEDULER = Annotated[
+    str | None, typer.Option(metavar="ADDRESS", help="existing Dask scheduler, tcp://host:8786, with its workers")
+]
 
 
 def rig_of(config: Config, dry_run: bool = False, speed: float | None = None) -> Rig:
@@ -61,9 +79,6 @@ def warn_of_no_dead_man(config: Config) -> str:
         "no dead-man is mapped: if this computer or the line fails, the device may hold the last command for ever;"
         f" map rig.{place}.heartbeat, or stand at the rig's stop"
     )
-
-
-OVERWRITE = Annotated[bool, typer.Option("--overwrite", help="replace what is at --out; an input never is")]
 
 
 def new_folder(out: Path, names: str | Sequence[str], inputs: Sequence[Path | None] = ()) -> None:

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from autotune.cli import app
+from autotune.cli.common import CONFIG, DRY_RUN, WITHOUT, ProgressBar, new_folder, rig_of
 from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
+from autotune.errors import InputError
 from autotune.whole_files import write_whole
 
 if TYPE_CHECKING:
@@ -27,7 +29,7 @@ _SAID = {
 
 @app.command()
 def investigate(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configuration of the rig")],
+    config: CONFIG,
     model: Annotated[Path, typer.Option(help="nominal model", metavar="M.toml")],
     out: Annotated[
         Path, typer.Option(help="new folder for recordings, rounds.json and the diagnosis's files", metavar="DIR")
@@ -42,19 +44,15 @@ def investigate(
     rig_time: Annotated[
         float | None, typer.Option(min=1.0, help="time under excitation in all [s]; default all rounds")
     ] = None,
-    without: Annotated[
-        list[str] | None, typer.Option(help="leave an effect out of the catalogue; may be given several times")
-    ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="run the rig's simulated twin instead of the rig")] = False,
+    without: WITHOUT = None,
+    dry_run: DRY_RUN = False,
     t: T = None,
     u: U = None,
     y: Y = None,
     r: R = None,
 ) -> None:
     """Run the experiments that tell apart what a model may leave out, until one hypothesis is left."""
-    from autotune.cli.common import ProgressBar, new_folder, rig_of
     from autotune.config import load_config
-    from autotune.errors import InputError
     from autotune.model_file import read_any
     from autotune.models import Model
     from autotune.pipeline.investigation import Budget, Listeners

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from autotune.cli import app
+from autotune.cli.common import SCHEDULER
 from autotune.cli.proof_steps import diagnose_all, print_table, publish
 from autotune.cli.prove_recorded import prove_recorded
 from autotune.errors import InputError, require_extra
@@ -41,9 +42,7 @@ def prove(
         str, typer.Option(help="ablation: leave this entry out of the catalogue and try its cases; 'all': each in turn")
     ] = "",
     most: Annotated[int, typer.Option(min=1, help="ablation: most cases of an entry")] = 3,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="existing Dask scheduler, tcp://host:8786, with its workers")
-    ] = None,
+    scheduler: SCHEDULER = None,
     recordings: Annotated[
         Path | None,
         typer.Option(

@@ -6,7 +6,6 @@ import signal
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -15,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from autotune.cli import app
+from autotune.cli.common import CONFIG
 from autotune.errors import LinkError
 from autotune.interrupts import signals_heard
 
@@ -28,11 +28,10 @@ if TYPE_CHECKING:
 
 #: how often whoever serves a rig looks whether a signal came [s]
 _LOOKS_S = 0.1
-_CONFIG = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configuration of the rig")]
 
 
 @app.command()
-def rig(config: _CONFIG) -> None:
+def rig(config: CONFIG) -> None:
     """Serve the config's simulated plant over its real transport, until stopped by Ctrl-C."""
     from autotune.cli.served import device_of, modbus_settings, serve_modbus, serve_opcua, serve_s7, serve_serial_line
     from autotune.config import load_config
@@ -75,7 +74,7 @@ def _registers_of(name: str, settings: AnyModbusSettings) -> Table:
 
 
 @app.command()
-def probe(config: _CONFIG) -> None:
+def probe(config: CONFIG) -> None:
     """Read every mapped register, or all a microcontroller says, once; nothing is written."""
     from autotune.config import load_config
     from drivers.kinds import kind_of
