@@ -120,25 +120,7 @@ def preflight(
             _check_at_rest(loop, first_row, first)
     y = loop.history(first_row)[2][1:]
     y = y[np.isfinite(y)]
-    timing = loop.timing
-    typical, late, _ = timing.latency_s
-    # where the device runs the relay, what the host does before may miss samples
-    may_miss = isinstance(loop.rig, RunsRelay) and not isinstance(loop.rig, Exchanges)
-    longest_s = 0.5 * loop.patience_s if may_miss else 0.8 * loop.sample_time_s
-    # one hiccup of the computer is none of the link's
-    if loop.slower_than(longest_s) > SLOW_SHARE:
-        raise LinkError(
-            f"link too slow: a reading takes {1e3 * typical:.3g} ms, up to {1e3 * late:.3g} ms in 99 %,"
-            f" the sample time is {1e3 * loop.sample_time_s:.3g} ms",
-            where="preflight",
-            remedy="raise signals.sample_time_s, or use a faster link",
-        )
-    link_rad_s = highest_frequency_rad_s(timing, loop.sample_time_s, gain_sd, exact=loop.is_exact)
-    tell(
-        f"a reading takes {1e3 * typical:.2g} ms, up to {1e3 * late:.2g} ms in 99 %, and the loop is up to"
-        f" {1e3 * timing.lateness_s[1]:.2g} ms late: this link supports points up to {link_rad_s:.3g} rad/s"
-    )
-    loop.note(link_rad_s=link_rad_s)
+    link_rad_s = _judge_link(loop, gain_sd, tell)
     steps = np.diff(y)
     # from differences: a plant that drifts is not taken for noise; from their median: nor are a few wild readings
     typical = 1.4826 * float(np.median(np.abs(steps)))
@@ -166,6 +148,30 @@ def preflight(
         plant_sign=point.plant_sign,
         link_rad_s=link_rad_s,
     )
+
+
+def _judge_link(loop: ControlLoop, gain_sd: float, tell: Tell) -> float:
+    """Refuse a link that is too slow, and return the frequency up to which it supports points [rad/s]."""
+    timing = loop.timing
+    typical, late, _ = timing.latency_s
+    # where the device runs the relay, what the host does before may miss samples
+    may_miss = isinstance(loop.rig, RunsRelay) and not isinstance(loop.rig, Exchanges)
+    longest_s = 0.5 * loop.patience_s if may_miss else 0.8 * loop.sample_time_s
+    # one hiccup of the computer is none of the link's
+    if loop.slower_than(longest_s) > SLOW_SHARE:
+        raise LinkError(
+            f"link too slow: a reading takes {1e3 * typical:.3g} ms, up to {1e3 * late:.3g} ms in 99 %,"
+            f" the sample time is {1e3 * loop.sample_time_s:.3g} ms",
+            where="preflight",
+            remedy="raise signals.sample_time_s, or use a faster link",
+        )
+    link_rad_s = highest_frequency_rad_s(timing, loop.sample_time_s, gain_sd, exact=loop.is_exact)
+    tell(
+        f"a reading takes {1e3 * typical:.2g} ms, up to {1e3 * late:.2g} ms in 99 %, and the loop is up to"
+        f" {1e3 * timing.lateness_s[1]:.2g} ms late: this link supports points up to {link_rad_s:.3g} rad/s"
+    )
+    loop.note(link_rad_s=link_rad_s)
+    return link_rad_s
 
 
 def _command_to_hold(loop: ControlLoop, point: OperatingPointSettings, u_rest: float | None) -> float:
