@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
 from autotune.cli import app
+from autotune.cli.common import SCHEDULER
+from autotune.errors import InputError, OperatorStop, require_extra
+
+if TYPE_CHECKING:
+    from autotune.batch.campaign import Campaign
+    from autotune.batch.row import Row
 
 
 @app.command()
@@ -19,23 +26,16 @@ def batch(
     workers: Annotated[
         int | None, typer.Option(min=1, help="processes on this machine; default as many as processors")
     ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="existing Dask scheduler, tcp://host:8786, with its workers")
-    ] = None,
+    scheduler: SCHEDULER = None,
 ) -> None:
     """Identify, design or diagnose every loop of a plant, or look at it in operation; a Parquet table and one page."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from autotune.errors import InputError, OperatorStop, require_extra
-
     require_extra("batch", "distributed", "pyarrow")
-    from autotune.batch.campaign import REPORT, RESULTS, Campaign, failed, write_results
+    from autotune.batch.campaign import Campaign, failed
     from autotune.batch.engine import cluster, require_scheduler, run_all
     from autotune.batch.loop import analyse_loop
-    from autotune.batch.row import ATTENTION
     from autotune.batch.settings import read_campaign
-    from autotune.report.campaign_page import campaign_page
-    from autotune.report.page import write_page
 
     settings, loops = read_campaign(campaign)
     work = Campaign(settings=settings, loops=loops, out=out.absolute())
@@ -71,8 +71,21 @@ def batch(
                     where=str(out),
                     remedy="the same command continues",
                 ) from None
-    ordered = write_results(rows.values(), work.out / RESULTS)
-    page = campaign_page(settings, ordered)
+    if not _report(work, rows.values(), out, console):
+        raise InputError(
+            "no loop could be analysed", where=str(campaign), remedy="the reason of each is above and in the report"
+        )
+
+
+def _report(work: Campaign, rows: Iterable[Row], out: Path, console: Console) -> bool:
+    """Write table and page, say what needs attention, and return whether any loop could be analysed."""
+    from autotune.batch.campaign import REPORT, RESULTS, write_results
+    from autotune.batch.row import ATTENTION
+    from autotune.report.campaign_page import campaign_page
+    from autotune.report.page import write_page
+
+    ordered = write_results(rows, work.out / RESULTS)
+    page = campaign_page(work.settings, ordered)
     write_page(page, work.out / REPORT)
     counts = Counter(row.attention for row in ordered)
     for row in [row for row in ordered if row.attention not in ("designed", "fine")][:10]:
@@ -81,7 +94,4 @@ def batch(
         console.print("and more, in the report", markup=False)
     console.print(page.verdict, markup=False)
     console.print(f"report: {out / REPORT}, table: {out / RESULTS}", markup=False)
-    if counts["failed"] == len(ordered):
-        raise InputError(
-            "no loop could be analysed", where=str(campaign), remedy="the reason of each is above and in the report"
-        )
+    return counts["failed"] < len(ordered)
