@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from autotune.cli import app
-from autotune.cli.common import OVERWRITE
+from autotune.cli.common import OVERWRITE, WITHOUT
 from autotune.cli.recordings import R, T, U, Y, read_all, read_one, signal_names
 from autotune.errors import InputError
 from autotune.outputs import Output, OutputFolder
@@ -108,9 +108,7 @@ def diagnose(
         Path | None,
         typer.Option(help="law that u was computed by; default: the recordings' sidecars", metavar="C.toml"),
     ] = None,
-    without: Annotated[
-        list[str] | None, typer.Option(help="leave an effect out of the catalogue; may be given several times")
-    ] = None,
+    without: WITHOUT = None,
     t: T = None,
     u: U = None,
     y: Y = None,
@@ -118,15 +116,24 @@ def diagnose(
     overwrite: OVERWRITE = False,
 ) -> None:
     """Find where and why recordings differ from the simulation: numbers, missing physics, or something else."""
+    names = signal_names(t, u, y, r)
     if routine:
         unused = {"--model": model, "--controller": controller, "--without": without}
-        _look_at_routine(recordings, out, unused, signal_names(t, u, y, r), overwrite=overwrite)
-        return
-    if model is None:
+        _look_at_routine(recordings, out, unused, names, overwrite=overwrite)
+    elif model is None:
         raise InputError(
             "no model", where="diagnose",
             remedy="give --model M.toml, or --routine for a loop in operation that has no model",
         )  # fmt: skip
+    else:
+        _compare_with_model(recordings, out, model, controller, without or (), names, overwrite=overwrite)
+
+
+def _compare_with_model(
+    recordings: Sequence[Path], out: Path, model: Path, controller: Path | None, without: Sequence[str],
+    names: SignalNames, *, overwrite: bool,
+) -> None:  # fmt: skip
+    """Find what a model leaves out of recordings, and write diagnosis.json, the extended model and the page."""
     from autotune.controller import read_controller
     from autotune.diagnosis.diagnose import diagnose as find
     from autotune.equations.files import write_any
@@ -138,11 +145,11 @@ def diagnose(
     files = ("diagnosis.json", "extended_model.toml", "report.html")
     place = OutputFolder(out, files, inputs=(model, controller, *recordings), overwrite=overwrite)
     nominal = read_any_model(model)
-    data = read_all(recordings, signal_names(t, u, y, r))
+    data = read_all(recordings, names)
     require_units_of_model(nominal, data)
     law = None if controller is None else read_controller(controller)
     with _progress_shown("diagnosing") as progress:
-        found = with_next_experiment(find(nominal, data, law, without or (), progress))
+        found = with_next_experiment(find(nominal, data, law, without, progress))
     with place.write_all() as folder:
         found.write(folder / "diagnosis.json")
         write_any(found.extended_model, folder / "extended_model.toml", base=model.parent)
