@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 
 from autotune.cli import app, identify
-from autotune.cli.common import OVERWRITE
+from autotune.cli.common import OVERWRITE, ProgressBar, rig_of
 from autotune.cli.recordings import R, T, U, Y, read_one, signal_names
 from autotune.errors import InputError
 from autotune.outputs import Output, claim
@@ -20,12 +20,14 @@ if TYPE_CHECKING:
     from autotune.identification.closed_loop.dither_proposal import DitherLimits
     from autotune.identification.closed_loop.identify import ClosedLoopIdentification
     from autotune.identification.closed_loop.state_space import InnovationModel
+    from autotune.recording import Recording
 
 
 #: How the plant is identified; the names of ``autotune.identification.closed_loop.methods``.
 ClosedLoopMethod: TypeAlias = Literal[
     "prediction-error", "indirect", "indirect-refitted", "van-overschee", "oku-tanaka", "ort", "ssarx", "pbsid"
 ]
+Columns: TypeAlias = list[str] | None
 
 
 @identify.command("closed-loop")
@@ -51,12 +53,10 @@ def closed_loop(
         ClosedLoopMethod,
         typer.Option(help="prediction-error has regions, evidence and a verdict; the others are the papers' own"),
     ] = "prediction-error",
-    more_u: Annotated[list[str] | None, typer.Option(metavar="COLUMN", help="a further input; may be repeated")] = None,
-    more_y: Annotated[
-        list[str] | None, typer.Option(metavar="COLUMN", help="a further output; may be repeated")
-    ] = None,
+    more_u: Annotated[Columns, typer.Option(metavar="COLUMN", help="a further input; may be repeated")] = None,
+    more_y: Annotated[Columns, typer.Option(metavar="COLUMN", help="a further output; may be repeated")] = None,
     more_r: Annotated[
-        list[str] | None, typer.Option(metavar="COLUMN", help="what was added to that further input; may be repeated")
+        Columns, typer.Option(metavar="COLUMN", help="what was added to that further input; may be repeated")
     ] = None,
     f: Annotated[int | None, typer.Option("--f", min=1, help="rows of the future, of a subspace method")] = None,
     p: Annotated[int | None, typer.Option("--p", min=1, help="rows of the past, likewise")] = None,
@@ -72,42 +72,42 @@ def closed_loop(
     place = Output(out, inputs=(recording, controller, config), overwrite=overwrite)  # refused before all imports
     from autotune.api import methods
     from autotune.controller import read_controller
-    from autotune.identification.closed_loop.identify import ClosedLoopIdentification
     from autotune.identification.closed_loop.state_space import InnovationModel
 
-    console = Console(stderr=True, highlight=False)
     data = read_one(recording, signal_names(t, u, y, r))
     law = None if controller is None else read_controller(controller)
+    windows = {"f": f, "p": p, "n_cl": n_cl, "Psi": psi}
     if method != "prediction-error" or more_u or more_y:
         if delay is not None or config is not None:
             raise InputError("--delay and --config are of prediction-error", where=method)
         more = more_u or [], more_y or [], more_r or []
-        windows = {"f": f, "p": p, "n_cl": n_cl, "Psi": psi}
         model = methods.closed_loop(data, order, controller=law, method=method, more=more, **windows)
         assert isinstance(model, InnovationModel)
         place.json(_model_json(model, method))
         poles = ", ".join(f"{pole:.4g}" for pole in model.poles)
         typer.echo(f"order {model.order} by {method}, poles {poles}")
-        typer.echo(f"wrote {out}")
-        return
-    if any(value is not None for value in (f, p, n_cl, psi)):
+    elif any(value is not None for value in windows.values()):
         raise InputError("--f, --p, --n-cl and --psi are of the other methods", where="prediction-error")
+    else:
+        limits = None if config is None else _limits(config)
+        _identify_with_regions(data, place, order, controller=law, delay=delay, max_order=max_order, limits=limits)
+    typer.echo(f"wrote {out}")
+
+
+def _identify_with_regions(data: Recording, place: Output, order: int | None, **settings: Any) -> None:
+    """Identify by prediction errors, write the model with its regions, and say what it is worth."""
+    from autotune.api import methods
+    from autotune.identification.closed_loop.identify import ClosedLoopIdentification
+
+    console = Console(stderr=True, highlight=False)
     with console.status("reading the loop") as status:
-        result = methods.closed_loop(
-            data,
-            order,
-            delay=delay,
-            controller=law,
-            max_order=max_order,
-            limits=None if config is None else _limits(config),
-            progress=lambda what, _: status.update(f"fitting {what}"),
-        )
+        settings["progress"] = lambda what, _: status.update(f"fitting {what}")
+        result = methods.closed_loop(data, order, **settings)
     assert isinstance(result, ClosedLoopIdentification)
     place.json(closed_loop_json(result))
     for warning in result.warnings:
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
     typer.echo(summary(result))
-    typer.echo(f"wrote {out}")
 
 
 def _model_json(model: InnovationModel, method: str) -> dict[str, Any]:
@@ -255,9 +255,7 @@ def dither(
     seed: Annotated[int, typer.Option(min=0, help="of the random dwell times")] = 0,
 ) -> None:
     """Add a dither to the rig's present controller and record r, u and y, within the limits of the config."""
-    from autotune.cli.common import ProgressBar, rig_of
     from autotune.config import load_config
-    from autotune.errors import InputError
     from autotune.experiment.dither import run_dither
 
     content = load_config(config)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 import typer
 
 from autotune.cli import app
-from autotune.cli.common import OVERWRITE
+from autotune.cli.common import NOISE_FREQUENCY, OVERWRITE, STRUCTURE, U_SPAN, Y_SPAN
 from autotune.controller_forms import FORMS, to_form
 from autotune.errors import InputError
 from autotune.outputs import Output
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 
     Asked = Callable[..., Specification]  # from the plant, and the highest frequency that is known of it
 
+_POINTS = Annotated[
+    Path | None,
+    typer.Option(help="points file (JSON) to design on, with its regions; or closed_loop.json, on its joint region"),
+]
+
 
 @app.command("design")
 def design_command(
     out: Annotated[Path, typer.Option(help="file to write the design to (JSON)")],
     model: Annotated[Path | None, typer.Option(help="model file (TOML) to design on")] = None,
-    points: Annotated[
-        Path | None,
-        typer.Option(
-            help="points file (JSON) to design on, with its regions; or closed_loop.json, on its joint region"
-        ),
-    ] = None,
+    points: _POINTS = None,
     modulus_margin: Annotated[float, typer.Option(help="smallest distance of L from -1, between 0 and 1")] = 0.5,
     phase_margin: Annotated[float, typer.Option(help="smallest phase margin [deg]")] = 45.0,
     noise_gain: Annotated[
@@ -43,9 +43,7 @@ def design_command(
         Literal["bound", "true"],
         typer.Option(help="true: |C/(1+L)| <= N_max (15); bound: |C| <= M_m N_max (16), which implies it"),
     ] = "true",
-    noise_frequency: Annotated[
-        float | None, typer.Option(help="lowest frequency of the noise [rad/s]; default the crossover")
-    ] = None,
+    noise_frequency: NOISE_FREQUENCY = None,
     criterion: Annotated[
         Literal["h2", "iae"],
         typer.Option(help="minimised after a step of load: the norm (11), or the integral of the absolute error"),
@@ -54,7 +52,7 @@ def design_command(
     setpoint_command: Annotated[
         float | None, typer.Option(help="largest immediate command per unit set-point step [u/y unit]; default none")
     ] = None,
-    kind: Annotated[Literal["pi", "pid"], typer.Option(help="structure of the controller")] = "pi",
+    kind: STRUCTURE = "pi",
     controller: Annotated[Path | None, typer.Option(help="also write the controller file (TOML) here")] = None,
     certificate: Annotated[bool, typer.Option(help="prove a lower bound on the H2 norm (PI on a model)")] = True,
     overwrite: OVERWRITE = False,
@@ -65,18 +63,13 @@ def design_command(
     place = Output(out, inputs=(model, points), overwrite=overwrite)  # refused before the method is imported
     law = None if controller is None else Output(controller, inputs=(model, points, out), overwrite=overwrite)
     from autotune.controller import write_controller
-    from autotune.design.noise import LoopFacts, default_noise_gain
     from autotune.design.specification import Specification
 
     def asked(plant: TransferFunction, highest_rad_s: float | None = None) -> Specification:
-        allowed = noise_gain
-        if allowed is None:
-            allowed, words = default_noise_gain(plant, LoopFacts(), highest_rad_s)
-            typer.echo(f"noise gain at most {allowed:.4g}: {words}")
         return Specification(
             modulus_margin=modulus_margin,
             phase_margin_rad=math.radians(phase_margin),
-            noise_gain=allowed,
+            noise_gain=_derive_noise_gain(plant, highest_rad_s) if noise_gain is None else noise_gain,
             noise=noise,
             noise_frequency_rad_s=noise_frequency,
             delay_margin_s=delay_margin,
@@ -94,6 +87,15 @@ def design_command(
         law.by(lambda part: write_controller(designed.controller, part))
     typer.echo(_sentence(designed))
     typer.echo(f"wrote {out}" + (f" and {controller}" if controller is not None else ""))
+
+
+def _derive_noise_gain(plant: TransferFunction, highest_rad_s: float | None) -> float:
+    """Return the noise gain that a plant asks for where the user does not, and say it."""
+    from autotune.design.noise import LoopFacts, default_noise_gain
+
+    allowed, words = default_noise_gain(plant, LoopFacts(), highest_rad_s)
+    typer.echo(f"noise gain at most {allowed:.4g}: {words}")
+    return allowed
 
 
 def _on_model(model: Path, asked: Asked, kind: Kind, *, certificate: bool) -> Design:
@@ -165,9 +167,7 @@ def margins_command(
     model: Annotated[Path, typer.Option(help="model file (TOML)")],
     controller: Annotated[Path, typer.Option(help="controller file (TOML), or a result.json")],
     out: Annotated[Path, typer.Option(help="file to write the margins to (JSON)")],
-    noise_frequency: Annotated[
-        float | None, typer.Option(help="lowest frequency of the noise [rad/s]; default the crossover")
-    ] = None,
+    noise_frequency: NOISE_FREQUENCY = None,
     overwrite: OVERWRITE = False,
 ) -> None:
     """Compute the margins of a controller with a model; a sampled controller is taken with its hold."""
@@ -202,8 +202,8 @@ def controller_command(
     controller: Annotated[Path, typer.Option(help="controller file (TOML) of kind pi or pid, or a result.json")],
     form: Annotated[Target, typer.Option(help="a maker's form, or c or st for the law as code")] = "isa",
     sample_time: Annotated[float, typer.Option(help="time between samples, for velocity, c and st [s]")] = 0.01,
-    u_span: Annotated[float, typer.Option(help="engineering span of the output, for percent forms [u unit]")] = 1.0,
-    y_span: Annotated[float, typer.Option(help="engineering span of the measurement [y unit]")] = 1.0,
+    u_span: U_SPAN = 1.0,
+    y_span: Y_SPAN = 1.0,
     u_min: Annotated[float | None, typer.Option(help="lowest command, for c and st [u unit]; default none")] = None,
     u_max: Annotated[float | None, typer.Option(help="highest command, for c and st [u unit]; default none")] = None,
     u_rate: Annotated[float | None, typer.Option(help="fastest change, for c and st [u unit/s]; default none")] = None,
