@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 from rich.console import Console
 
 from autotune.cli import app
-from autotune.cli.common import ProgressBar, rig_of
+from autotune.cli.common import CONFIG, U_SPAN, Y_SPAN, ProgressBar, rig_of
 from autotune.controller_forms import FORMS
 from autotune.errors import AutotuneError, ExperimentStopped, InputError
+from autotune.outputs import OutputFolder
 from autotune.whole_files import jsonable, write_json
 
 if TYPE_CHECKING:
@@ -26,12 +28,12 @@ if TYPE_CHECKING:
     from autotune.identification.parametric import PlantFit
     from autotune.pipeline.audit import AuditLog
     from autotune.pipeline.folder import Measured
+    from autotune.report.page import Page
 
     Form: TypeAlias = str
 else:
     Form = Literal[tuple(FORMS)]
 
-_CONFIG = Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="configuration of the rig")]
 _CONTROLLER = Annotated[Path | None, typer.Option(metavar="C.toml", help="controller file with the gains")]
 _RUN = Annotated[
     Path | None, typer.Option(metavar="DIR", help="folder of a run: its points predict the loop, its files go there")
@@ -43,21 +45,20 @@ _OUT = Annotated[
     Path | None,
     typer.Option(metavar="DIR", help="folder for journal, recording and page; default: the run's, or NAME-gains"),
 ]
+_FORM = Annotated[Form, typer.Option(help="form that the gains are shown in, as the controller's maker calls them")]
 
 
 @app.command()
 def deploy(
-    config: _CONFIG,
+    config: CONFIG,
     controller: _CONTROLLER = None,
     design: Annotated[Path | None, typer.Option(metavar="design.json", help="design with the gains")] = None,
     run: _RUN = None,
     points: _POINTS = None,
     out: _OUT = None,
-    form: Annotated[
-        Form, typer.Option(help="form that the gains are shown in, as the controller's maker calls them")
-    ] = "isa",
-    u_span: Annotated[float, typer.Option(help="engineering span of the output, for percent forms [u unit]")] = 1.0,
-    y_span: Annotated[float, typer.Option(help="engineering span of the measurement [y unit]")] = 1.0,
+    form: _FORM = "isa",
+    u_span: U_SPAN = 1.0,
+    y_span: Y_SPAN = 1.0,
     verify: Annotated[bool, typer.Option(help="try the new gains on the rig and take them back if they fail")] = True,
     yes: Annotated[bool, typer.Option("--yes", help="do not ask")] = False,
     approved_by: Annotated[
@@ -70,17 +71,17 @@ def deploy(
     from autotune.pipeline.approval import approval_of
     from autotune.pipeline.audit import audit_log
     from autotune.pipeline.deployment import deploy as hand_over
-    from autotune.pipeline.folder import JOURNAL, next_free
+    from autotune.pipeline.folder import JOURNAL
     from autotune.pipeline.held_gains import round_to_rig
-    from autotune.pipeline.result import verification_json
+    from autotune.pipeline.result import deployment_json
     from autotune.pipeline.sensible_gains import require_sensible
-    from autotune.report.page import write_page
     from autotune.report.run_page import deployment_page
 
     content = load_config(config)
     approval = approval_of(content, approved_by, reason)
     new = _gains(controller, design, run)
-    measured, fit = _plant(run, points) if verify or run is not None or points is not None else (None, None)
+    known = _plant(run, points) if verify or run is not None or points is not None else None
+    fit = None if known is None else known[1]
     rig = _with_gains(rig_of(content))
     new = round_to_rig(rig, new, content.design, fit=fit)
     if not yes and not sys.stdin.isatty():
@@ -100,61 +101,53 @@ def deploy(
         folder.mkdir(parents=True, exist_ok=True)  # not before: what is refused leaves no folder
 
     def try_out(held: PIDController, gains: TrialGains | None) -> Verification:
-        assert measured is not None
-        assert fit is not None
-        return _verify(rig, content, held, fit, measured, folder, gains=gains)
+        assert known is not None
+        return _verify(rig, content, held, known, folder, gains=gains)
 
-    trial = try_out if verify else None
-    done = hand_over(rig, new, folder / JOURNAL, agree=agree, try_out=trial, audit=audit)
-    verification = done.verification
-    result = next_free(folder / "deploy.json", ".html")
-    said = {
-        "old": asdict(done.old),
-        "new": asdict(done.new),
-        "kept": done.kept,
-        "verified": verification.whose if verification is not None else "not verified",
-        "verification": verification_json(verification) if verification is not None else None,
-    }
-    write_json(result, jsonable(said))
-    page = deployment_page(content.name, content.signals, done)
-    write_page(page, result.with_suffix(".html"))
-    console.print(page.verdict, markup=False)
-    console.print(f"report: {result.with_suffix('.html')}", markup=False)
+    done = hand_over(rig, new, folder / JOURNAL, agree=agree, try_out=try_out if verify else None, audit=audit)
+    said = deployment_json(done)
+    _report(folder / "deploy.json", said, lambda: deployment_page(content.name, content.signals, done))
     if not done.kept:
         raise typer.Exit(ExperimentStopped.exit_status)
 
 
 @app.command()
 def verify(
-    config: _CONFIG, run: _RUN = None, points: _POINTS = None, controller: _CONTROLLER = None, out: _OUT = None
+    config: CONFIG, run: _RUN = None, points: _POINTS = None, controller: _CONTROLLER = None, out: _OUT = None
 ) -> None:
     """Try the gains that the rig's own controller holds (or a file's) on the rig, against what its points predict."""
     from autotune.config import load_config
     from autotune.experiment.rig import HoldsGains
     from autotune.pipeline.deployment import read_gains
-    from autotune.pipeline.folder import next_free
     from autotune.pipeline.result import verification_json
-    from autotune.report.page import write_page
     from autotune.report.run_page import verification_page
 
     content = load_config(config)
-    measured, fit = _plant(run, points)
+    known = _plant(run, points)
     rig = rig_of(content)
     own = isinstance(rig, HoldsGains) and controller is None
     gains = read_gains(rig) if isinstance(rig, HoldsGains) and own else _gains(controller, None, run)
     folder = _folder(config, run, out)
     folder.mkdir(parents=True, exist_ok=True)
-    verification = _verify(rig, content, gains, fit, measured, folder, on_device=own)
-    result = next_free(folder / "verify.json", ".html")
+    verification = _verify(rig, content, gains, known, folder, on_device=own)
     said = {"controller": asdict(gains), "verification": verification_json(verification)}
+    _report(folder / "verify.json", said, lambda: verification_page(content.name, content.signals, gains, verification))
+    if not verification.accepted:
+        raise typer.Exit(ExperimentStopped.exit_status)
+
+
+def _report(place: Path, said: Mapping[str, Any], draw: Callable[[], Page]) -> None:
+    """Write what was found and its page, beside those of earlier calls, and say the verdict."""
+    from autotune.pipeline.folder import next_free
+    from autotune.report.page import write_page
+
+    result = next_free(place, ".html")
     write_json(result, jsonable(said))
-    page = verification_page(content.name, content.signals, gains, verification)
+    page = draw()  # not before: the figures are kept whatever becomes of the page
     write_page(page, result.with_suffix(".html"))
     console = Console(highlight=False, soft_wrap=True)
     console.print(page.verdict, markup=False)
     console.print(f"report: {result.with_suffix('.html')}", markup=False)
-    if not verification.accepted:
-        raise typer.Exit(ExperimentStopped.exit_status)
 
 
 def _gains(controller: Path | None, design: Path | None, run: Path | None) -> PIDController:
@@ -215,8 +208,6 @@ def _with_gains(rig: Rig) -> HoldsGains:
 
 def _folder(config: Path, run: Path | None, out: Path | None) -> Path:
     """Return the folder of the journal: the same for every call with the same arguments, so that it is found again."""
-    from autotune.outputs import OutputFolder
-
     return OutputFolder(out or run or config.with_name(f"{config.stem}-gains"), ()).path
 
 
@@ -244,32 +235,18 @@ def _restore_interrupted(rig: HoldsGains, journal: Path, console: Console, yes: 
 
 
 def _verify(
-    rig: Rig,
-    config: Config,
-    controller: PIDController,
-    fit: PlantFit,
-    measured: Measured,
-    folder: Path,
-    *,
-    on_device: bool = False,
-    gains: TrialGains | None = None,
-) -> Verification:
+    rig: Rig, config: Config, controller: PIDController, known: tuple[Measured, PlantFit], folder: Path, *,
+    on_device: bool = False, gains: TrialGains | None = None,
+) -> Verification:  # fmt: skip
     from autotune.experiment.verify import run_verification
     from autotune.pipeline.folder import VERIFICATION, next_free
 
+    measured, fit = known
     with ProgressBar() as bar:
         return run_verification(
-            rig,
-            config,
-            controller,
-            fit,
-            next_free(folder / VERIFICATION, ".toml"),
-            u_rest=measured.u_rest,
-            noise_sd=measured.noise_sd,
-            on_device=on_device,
-            gains=gains,
-            on_status=bar.show,
-        )
+            rig, config, controller, fit, next_free(folder / VERIFICATION, ".toml"),
+            u_rest=measured.u_rest, noise_sd=measured.noise_sd, on_device=on_device, gains=gains, on_status=bar.show,
+        )  # fmt: skip
 
 
 def _comparison(

@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # a recording is tuned without a rig and without a diagnosis
     from autotune.experiment.judgement import Verification
     from autotune.experiment.result import ExperimentResult
     from autotune.experiment.running_law import RunningLaw
+    from autotune.pipeline.deployment import Deployment
 
 
 def write_result(
@@ -145,6 +146,18 @@ def verification_json(verification: Verification) -> dict[str, Any]:
         "running_law": _running_law_json(verification.running_law),
         "predicted": asdict(verification.predicted) | {"rms_error_allowed": verification.allowed},
         "measured": asdict(verification.measured) | {"rms_error": verification.rms_error},
+    }
+
+
+def deployment_json(done: Deployment) -> dict[str, Any]:
+    """Return the gains before and after a hand-over, with what was seen of the new ones."""
+    seen = done.verification
+    return {
+        "old": asdict(done.old),
+        "new": asdict(done.new),
+        "kept": done.kept,
+        "verified": seen.whose if seen is not None else "not verified",
+        "verification": verification_json(seen) if seen is not None else None,
     }
 
 
