@@ -59,6 +59,7 @@ def _root(
 from autotune.cli import (  # noqa: E402, F401, I001
     recordings,
     run,
+    tune,
     deploy,
     live,
     frequency,

@@ -1,31 +1,31 @@
-"""Commands: the whole chain, from a config file to a verified controller, and from recordings to a controller."""
+"""Command: the whole chain, from a config file to a verified controller."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
 from autotune.cli import app
-from autotune.cli.common import OVERWRITE, ProgressBar, new_folder, rig_of, warn_of_no_dead_man
+from autotune.cli.common import DRY_RUN, ProgressBar, new_folder, rig_of, warn_of_no_dead_man
 from autotune.cli.live import LISTEN, PORT, TOKEN_FILE
-from autotune.cli.recordings import R, T, U, Y, read_all, signal_names
 from autotune.errors import ExperimentStopped, InputError
-from autotune.outputs import OutputFolder
-from autotune.whole_files import write_json
 
 if TYPE_CHECKING:
     from autotune.config import Config
-    from autotune.controller import PIDController
     from autotune.diagnosis.result import Diagnosis
     from autotune.pipeline import Tuning
 
-_OUT = Annotated[Path, typer.Option(metavar="DIR", help="new folder for result.json and report.html")]
+_SPEED = Annotated[
+    float | None,
+    typer.Option(
+        min=0.01, help="seconds of a simulated rig in one second, to watch it with --live; default as fast as it can go"
+    ),
+]
 
 
 @app.command()
@@ -40,7 +40,7 @@ def run(
     resume: Annotated[
         Path | None, typer.Option(metavar="DIR", help="folder of an interrupted run: go on with the points it has")
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="run the rig's simulated twin instead of the rig")] = False,
+    dry_run: DRY_RUN = False,
     verify: Annotated[bool, typer.Option(help="try the new loop on the rig")] = True,
     deploy: Annotated[bool, typer.Option(help="write accepted gains into the rig's own controller")] = True,
     diagnose: Annotated[
@@ -49,13 +49,7 @@ def run(
     live: Annotated[
         bool, typer.Option("--live", help="show the run in the browser, with Abort and the decision")
     ] = False,
-    speed: Annotated[
-        float | None,
-        typer.Option(
-            min=0.01,
-            help="seconds of a simulated rig in one second, to watch it with --live; default as fast as it can go",
-        ),
-    ] = None,
+    speed: _SPEED = None,
     listen: LISTEN = "127.0.0.1",
     port: PORT = 0,
     token_file: TOKEN_FILE = None,
@@ -65,9 +59,6 @@ def run(
     from autotune.live.session import LivePage, read_token
     from autotune.pipeline import tune
     from autotune.pipeline.folder import FILES_OF_A_RUN, may_store
-    from autotune.recording import read_recording
-    from autotune.report.page import write_page
-    from autotune.report.run_page import run_page
 
     rig = rig_of(content, speed=speed)
     if out is not None:
@@ -80,34 +71,37 @@ def run(
     with LivePage(folder, listen, port, read_token(token_file)) if live else nullcontext() as onlooker:
         keep = onlooker.keep if onlooker is not None else None
         with _page_where_stopped(content, folder), ProgressBar() as bar:
-            tuning = tune(
-                rig,
-                content,
-                folder,
-                verify=verify,
-                deploy=deploy,
-                resume=resume is not None,
-                on_status=bar.show,
-                keep=keep,
-            )
+            asked = {"verify": verify, "deploy": deploy, "resume": resume is not None}
+            tuning = tune(rig, content, folder, **asked, on_status=bar.show, keep=keep)
         missed = tuning.verification is not None and not tuning.verification.accepted
         found = _diagnose(content, tuning, folder, console) if missed or diagnose else None
-        recordings = [read_recording(folder / part.recording) for part in tuning.experiment.parts]
-        page = run_page(content.name, content.signals, recordings, tuning, found)
-        write_page(page, folder / "report.html")
-        for warning in (*tuning.experiment.warnings, *tuning.analysis.warnings):
-            console.print(f"warning: {warning}", markup=False)
-        for note in tuning.analysis.notes:
-            console.print(f"note: {note}", markup=False)
-        console.print(page.verdict, markup=False)
-        if deploy and content.approval is not None:
-            again = f"autotune deploy CONFIG.toml --run {folder} --approved-by NAME --reason TEXT"
-            console.print(f"not handed over: [approval] asks for a second person: {again}", markup=False)
-        for sentence in found.sentences if found is not None else ():
-            console.print(sentence, markup=False)
-        console.print(f"report: {folder / 'report.html'}", markup=False)
+        _report(content, tuning, found, folder, console, is_withheld=deploy and content.approval is not None)
     if missed:
         raise typer.Exit(ExperimentStopped.exit_status)
+
+
+def _report(
+    config: Config, tuning: Tuning, found: Diagnosis | None, folder: Path, console: Console, *, is_withheld: bool
+) -> None:
+    """Write the page, and say the verdict with all that is to be known beside it."""
+    from autotune.recording import read_recording
+    from autotune.report.page import write_page
+    from autotune.report.run_page import run_page
+
+    recordings = [read_recording(folder / part.recording) for part in tuning.experiment.parts]
+    page = run_page(config.name, config.signals, recordings, tuning, found)
+    write_page(page, folder / "report.html")
+    for warning in (*tuning.experiment.warnings, *tuning.analysis.warnings):
+        console.print(f"warning: {warning}", markup=False)
+    for note in tuning.analysis.notes:
+        console.print(f"note: {note}", markup=False)
+    console.print(page.verdict, markup=False)
+    if is_withheld:
+        again = f"autotune deploy CONFIG.toml --run {folder} --approved-by NAME --reason TEXT"
+        console.print(f"not handed over: [approval] asks for a second person: {again}", markup=False)
+    for sentence in found.sentences if found is not None else ():
+        console.print(sentence, markup=False)
+    console.print(f"report: {folder / 'report.html'}", markup=False)
 
 
 @contextmanager
@@ -173,118 +167,3 @@ def _diagnose(config: Config, tuning: Tuning, folder: Path, console: Console) ->
     write_diagnosis_page(found, place / "report.html")
     append_diagnosis(folder / RESULT, found)
     return found
-
-
-def _pid_in_use(path: Path) -> PIDController:
-    """Return the PI or PID of a file; another law has no gains to stand beside the new ones."""
-    from autotune.controller import PIDController, read_controller
-
-    found = read_controller(path)
-    if not isinstance(found, PIDController):
-        raise InputError("no PI or PID", where=str(path), remedy='--present takes kind = "pi" with K and Ti_s')
-    return found
-
-
-@app.command()
-def tune(
-    out: _OUT,
-    recordings: Annotated[list[Path] | None, typer.Argument(metavar="REC.csv", help="recordings of the plant")] = None,
-    points: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="FILE.json",
-            help="points.json or closed_loop.json, joined with the recordings' points; may be given more than once",
-        ),
-    ] = None,
-    specification: Annotated[
-        Literal["Spec1", "Spec2"],
-        typer.Option(help="Spec1: modulus margin 0.5 and 45 deg; Spec2: 0.8 and 60 deg, for a plant that varies"),
-    ] = "Spec1",
-    modulus_margin: Annotated[float | None, typer.Option(help="replaces the named one, 0 to 1")] = None,
-    phase_margin: Annotated[float | None, typer.Option(help="replaces the named one [deg]")] = None,
-    noise_gain: Annotated[
-        float | None,
-        typer.Option(
-            help="largest amplification of noise to command [u unit/y unit]; default from recorded noise and span of u"
-        ),
-    ] = None,
-    noise_frequency: Annotated[
-        float | None, typer.Option(help="lowest frequency of the noise [rad/s]; default the crossover")
-    ] = None,
-    sample_time: Annotated[
-        float | None, typer.Option(help="period of the controller that is to run [s]; default the recording's")
-    ] = None,
-    kind: Annotated[Literal["pi", "pid"], typer.Option(help="structure of the controller")] = "pi",
-    criterion: Annotated[
-        Literal["auto", "iae", "h2"],
-        typer.Option(
-            help="minimised after a step of load: integral of the absolute error, or the norm (11); auto: iae for"
-            " plain recordings, h2 for points, as in a run"
-        ),
-    ] = "auto",
-    source: Annotated[
-        Literal["auto", "reduced model", "points", "fitted plant"],
-        typer.Option(help="what to design on; auto: the first that keeps its margins on everything measured"),
-    ] = "auto",
-    present: Annotated[
-        Path | None,
-        typer.Option(metavar="C.toml", help="the gains in use today: the page shows the new ones beside them"),
-    ] = None,
-    t: T = None,
-    u: U = None,
-    y: Y = None,
-    r: R = None,
-    overwrite: OVERWRITE = False,
-) -> None:
-    """Design a controller from recordings and points, without a rig: model, controller, checks, report."""
-    from autotune.config.procedure import DesignSettings, SignalSettings
-    from autotune.controller import write_controller
-    from autotune.pipeline import CONTROLLER, RESULT, analyse, analysis_json, measure_plant
-    from autotune.points import read_points, require_regions
-    from autotune.report.page import write_page
-    from autotune.report.tuned_page import analysis_page
-    from autotune.schema import validate
-
-    recordings, files = recordings or [], points or []
-    if not recordings and not files:
-        raise InputError("give recordings or --points", where="autotune tune")
-    place = OutputFolder(out, (RESULT, CONTROLLER, "report.html"), inputs=(*recordings, *files), overwrite=overwrite)
-    options = {
-        "modulus_margin": modulus_margin,
-        "phase_margin_deg": phase_margin,
-        "noise_gain": noise_gain,
-        "noise_frequency_rad_s": noise_frequency,
-        "sample_time_s": sample_time,
-    }
-    given_options = {name: value for name, value in options.items() if value is not None}
-    asked = validate(
-        DesignSettings,
-        {"kind": kind, "specification": specification, "source": source, "criterion": criterion, **given_options},
-        "autotune tune",
-    )
-    today = None if present is None else _pid_in_use(present)
-    read = read_all(recordings, signal_names(t, u, y, r))
-    given = [point for path in files for point in read_points(path)]
-    if given and not read:
-        require_regions(given, ", ".join(map(str, files)))
-    with ProgressBar() as bar:
-        found = measure_plant(read, given, bar.work)
-        analysis = analyse(found.points, asked, fit=found.fit, facts=found.facts, progress=bar.work)
-    notes = found.notes
-    units = read[0].metadata.get("units", {}) if read else {}
-    signals = SignalSettings(
-        sample_time_s=read[0].sample_time_s if read else 1.0,  # the page shows units only
-        u_unit=str(units.get("u", "")),
-        y_unit=str(units.get("y", "")),
-    )
-    name, now = ", ".join(path.stem for path in (*recordings, *files)), datetime.now().astimezone()
-    page = analysis_page(name, signals, read, analysis, notes, present=today, made=now)
-    with place.write_all() as folder:
-        write_json(folder / RESULT, analysis_json(analysis))
-        write_controller(analysis.controller, folder / CONTROLLER)
-        write_page(page, folder / "report.html")
-    console = Console(highlight=False, soft_wrap=True)
-    for note in (*notes, *analysis.warnings, *analysis.notes):
-        console.print(f"note: {note}", markup=False)
-    console.print(page.verdict, markup=False)
-    console.print(f"report: {out / 'report.html'}, controller: {out / CONTROLLER}", markup=False)
