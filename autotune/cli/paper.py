@@ -31,6 +31,15 @@ _DRAWN: dict[str, tuple[Any, int]] = {
     "default": ("prediction-error", 0),
 }
 
+_NOISE_GAIN = Annotated[
+    float | None,
+    typer.Option(
+        min=1e-9,
+        help="N_max of the design and of (26) [u/y unit]; when absent 0.1 of the paper's ball, "
+        "else ten over the plant's gain where its phase is -135 degrees",
+    ),
+]
+
 
 @paper.command("relay")
 def relay(
@@ -46,14 +55,7 @@ def relay(
         typer.Option(help="controller file (TOML) or result.json; the PI designed on the reduced model when absent"),
     ] = None,
     beside: Annotated[list[Path] | None, typer.Option(help="a further controller file; may be repeated")] = None,
-    noise_gain: Annotated[
-        float | None,
-        typer.Option(
-            min=1e-9,
-            help="N_max of the design and of (26) [u/y unit]; when absent 0.1 of the paper's ball, "
-            "else ten over the plant's gain where its phase is -135 degrees",
-        ),
-    ] = None,
+    noise_gain: _NOISE_GAIN = None,
     dominant: Annotated[
         float | None, typer.Option(min=1e-9, help="with --rest an RST too: its double dominant pole [rad/s]")
     ] = None,
@@ -90,25 +92,18 @@ def relay(
     reduced = reduce(measured if measured else known)
     laws: dict[str, Law] = {}
     if controller is None:
-        laws["PI on the reduced model"] = tune(reduced, noise_gain=noise_gain, certificate=False).controller
+        plants = {"PI on the reduced model": reduced, **({"PI on (23)": known} if of_paper else {})}
+        laws |= {name: tune(one, noise_gain=noise_gain, certificate=False).controller for name, one in plants.items()}
     else:
         laws[controller.stem] = read_controller(controller)
     first = next(iter(laws.values()))
-    if of_paper and controller is None:
-        laws["PI on (23)"] = tune(known, noise_gain=noise_gain, certificate=False).controller
     laws |= {path.stem: read_controller(path) for path in beside or []}
     if dominant is not None and rest is not None:
         laws["RST placed here"] = rst(known, dominant_rad_s=dominant, rest_rad_s=rest)
-    page = relay_page(
-        measured,
-        reduced,
-        known,
-        laws,
-        validate(known, reduced, first),
-        noise_gain,
-        "the plant fitted to the points" if plant is None and measured else "the plant",
-        comparison_rst(known) if of_paper else None,
-    )
+    compared = validate(known, reduced, first)
+    named = "the plant fitted to the points" if plant is None and measured else "the plant"
+    rebuilt = comparison_rst(known) if of_paper else None
+    page = relay_page(measured, reduced, known, laws, compared, noise_gain, named, rebuilt)
     place.by(lambda part: write_page(page, part))
     typer.echo(f"{page.verdict} wrote {out}")
 
