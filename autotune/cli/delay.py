@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 import typer
 
 from autotune.cli import identify
-from autotune.cli.common import OVERWRITE
+from autotune.cli.common import INTEGRATOR, OVERWRITE
 from autotune.cli.recordings import R, T, U, Y, read_one, signal_names
 from autotune.outputs import Output
 
@@ -20,6 +20,21 @@ if TYPE_CHECKING:
 
 #: How u runs between rows.
 Hold: TypeAlias = Literal["zero", "linear"]
+
+_METHOD = Annotated[
+    Literal["output-error", "algebraic", "online"],
+    typer.Option(
+        help="output-error is maximum likelihood; algebraic and online are modulating functions, on intervals or "
+        "row by row"
+    ),
+]
+_INTERVAL = Annotated[
+    float | None, typer.Option(min=1e-6, help="length of the modulated intervals [s]; default a seventh of the record")
+]
+_FORGETTING = Annotated[
+    float | None,
+    typer.Option(min=1e-9, help="of --method online: rate of the kernels [1/s]; default 100 over the record"),
+]
 
 
 @identify.command("delay")
@@ -40,27 +55,15 @@ def identify_delay_command(
     start: Annotated[
         float | None, typer.Option(help="time stamp from which y is used [s]; default the first row")
     ] = None,
-    integrator: Annotated[bool, typer.Option("--integrator", help="the plant integrates: a0 = 0")] = False,
+    integrator: INTEGRATOR = False,
     offset: Annotated[bool, typer.Option(help="estimate a constant offset of u or y")] = True,
     coloured: Annotated[bool, typer.Option(help="allow coloured (autoregressive) noise")] = True,
-    method: Annotated[
-        Literal["output-error", "algebraic", "online"],
-        typer.Option(
-            help="output-error is maximum likelihood; algebraic and online are modulating functions, on intervals or "
-            "row by row"
-        ),
-    ] = "output-error",
+    method: _METHOD = "output-error",
     delays: Annotated[
         int, typer.Option(min=1, max=2, help="2: x'' + a x(t - h1) = b u(t - h2), the output is delayed as well")
     ] = 1,
-    interval: Annotated[
-        float | None,
-        typer.Option(min=1e-6, help="length of the modulated intervals [s]; default a seventh of the record"),
-    ] = None,
-    forgetting: Annotated[
-        float | None,
-        typer.Option(min=1e-9, help="of --method online: rate of the kernels [1/s]; default 100 over the record"),
-    ] = None,
+    interval: _INTERVAL = None,
+    forgetting: _FORGETTING = None,
     start_delay: Annotated[
         float | None, typer.Option(min=0.0, help="starting value of the delay [s]; found when absent")
     ] = None,

@@ -10,17 +10,30 @@ from typing import TYPE_CHECKING, Annotated, TextIO
 import typer
 
 from autotune.cli import app
-from autotune.cli.common import OVERWRITE
+from autotune.cli.common import INTEGRATOR, OVERWRITE, new_folder, rig_of
 from autotune.cli.delay import Hold
 from autotune.cli.recordings import R, T, U, Y, read_one, signal_names
+from autotune.errors import InputError
 from autotune.outputs import Output
 
 if TYPE_CHECKING:
-    from autotune.config.loader import Config
     from autotune.controller import Controller
     from autotune.files import SignalNames
     from autotune.identification.delay.tracking import Window
     from autotune.recording import Recording
+
+_ORDER = Annotated[
+    int | None,
+    typer.Option(
+        min=1, max=4, help="order n of the tracked model, 1 to 4; default 2 or 1, what the recording determines"
+    ),
+]
+_FOLLOW = Annotated[
+    float,
+    typer.Option(
+        min=0.0, max=1e6, help="go on while the recording grows, until it has not for this long [s]; 0: do not wait"
+    ),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,12 +65,7 @@ def watch(
     controller: Annotated[
         Path | None, typer.Option(help="the deployed controller, TOML; its margins are judged on the tracked model")
     ] = None,
-    order: Annotated[
-        int | None,
-        typer.Option(
-            min=1, max=4, help="order n of the tracked model, 1 to 4; default 2 or 1, what the recording determines"
-        ),
-    ] = None,
+    order: _ORDER = None,
     window: Annotated[
         float | None, typer.Option(min=1e-6, help="length of y each fit uses [s]; default a fifth of it")
     ] = None,
@@ -70,13 +78,8 @@ def watch(
     modulus_margin: Annotated[float, typer.Option(min=0.01, max=0.99, help="modulus margin to be kept, 0 to 1")] = 0.5,
     phase_margin: Annotated[float, typer.Option(min=0.1, max=89.9, help="phase margin to be kept [deg]")] = 45.0,
     hold: Annotated[Hold | None, typer.Option(help="u between rows; default the sidecar's hold, else zero")] = None,
-    integrator: Annotated[bool, typer.Option("--integrator", help="the plant integrates: a0 = 0")] = False,
-    follow: Annotated[
-        float,
-        typer.Option(
-            min=0.0, max=1e6, help="go on while the recording grows, until it has not for this long [s]; 0: do not wait"
-        ),
-    ] = 0.0,
+    integrator: INTEGRATOR = False,
+    follow: _FOLLOW = 0.0,
     duration: Annotated[float, typer.Option(min=1.0, max=1e7, help="with CONFIG: time on the rig [s]")] = 300.0,
     dither: Annotated[
         float | None, typer.Option(help="with CONFIG: half-amplitude added to the command [u unit]; found when absent")
@@ -92,9 +95,8 @@ def watch(
     With a recording, one that another program is still writing included, nothing is commanded. With a configuration
     the present controller runs the rig with a small dither, without which a loop at rest tells nothing.
     """
-    from autotune.controller import PIDController, read_controller
+    from autotune.controller import read_controller
 
-    law: Controller | None = None if controller is None else read_controller(controller)
     settings = _Tracking(
         order=order,
         window_s=window,
@@ -102,32 +104,32 @@ def watch(
         max_delay_s=max_delay,
         hold=hold,
         integrator=integrator,
-        controller=law,
+        controller=None if controller is None else read_controller(controller),
         modulus_margin=modulus_margin,
         phase_margin_rad=math.radians(phase_margin),
         names=signal_names(t, u, y, r),
     )
     if source.suffix.lower() != ".toml":
         _follow(source, Output(out, inputs=(source, controller), overwrite=overwrite), settings, follow)
-        return
-    from autotune.config import load_config
-
-    config = load_config(source)
-    if law is None and config.controller is not None:
-        settings = replace(settings, controller=PIDController(K=config.controller.K, Ti_s=config.controller.Ti_s))
-    length = 0.2 * duration if window is None else window
-    _watch_rig(config, out, replace(settings, window_s=length), duration, dither)
+    else:
+        _watch_rig(source, out, settings, duration, dither)
 
 
-def _watch_rig(config: Config, out: Path, settings: _Tracking, duration_s: float, dither: float | None) -> None:
+def _watch_rig(source: Path, out: Path, settings: _Tracking, duration_s: float, dither: float | None) -> None:
     """Run the present loop here and fit in another process, so that no fit ever delays a command."""
     import multiprocessing
 
-    from autotune.cli.common import new_folder, rig_of
+    from autotune.config import load_config
+    from autotune.controller import PIDController
     from autotune.experiment.dither import run_dither
     from autotune.experiment.warm import warm_up
     from autotune.interrupts import interrupt_held
 
+    config = load_config(source)
+    if settings.controller is None and config.controller is not None:
+        settings = replace(settings, controller=PIDController(K=config.controller.K, Ti_s=config.controller.Ti_s))
+    if settings.window_s is None:
+        settings = replace(settings, window_s=0.2 * duration_s)
     new_folder(out, ("recording.csv", "recording.toml", "watch.csv"))
     warm_up()  # a first compilation may take longer than a recording may be quiet
     recording = out / "recording.csv"
@@ -219,8 +221,6 @@ def _in_operation(record: Recording) -> Recording | None:
 
 def _of_operation(recording: Path, settings: _Tracking) -> Recording:
     """Return a finished recording of the loop in operation."""
-    from autotune.errors import InputError
-
     record = _in_operation(read_one(recording, settings.names))
     if record is None:
         raise InputError(
@@ -231,7 +231,6 @@ def _of_operation(recording: Path, settings: _Tracking) -> Recording:
 
 def _readable(recording: Path, settings: _Tracking) -> Recording | None:
     """Return what a growing recording holds of the loop in operation, None while that is less than two rows."""
-    from autotune.errors import InputError
     from autotune.files import read_recordings
 
     try:
