@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
 import typer
 from rich.console import Console
@@ -67,6 +67,37 @@ PLANTS: Mapping[Plant, Table] = {
 }  # fmt: skip
 
 
+def _take_number(help: str) -> Any:
+    """Return an option whose number may have a decimal comma."""
+    return typer.Option(parser=number_of_option, metavar="NUMBER", help=help)
+
+
+_Pair: TypeAlias = tuple[float, float] | None
+_REGISTERS = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--register",
+        metavar=f"NAME={REGISTER}",
+        help="any further register of the map, e.g. heartbeat=holding:2:uint16, enable=holding:20,bit=3,"
+        " gains.PB_percent=holding:30,scale=0.1; may be given more than once",
+    ),
+]
+_MODEL = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE|H(s)",
+        help=f"in place of --plant: a model file, or a transfer function as you write it, {EXAMPLE} or zpk([-1];"
+        " [-2, -3]; 4) or K=2 T=0.3,0.1 L=0.05, which becomes a model file beside the configuration",
+    ),
+]
+_KEYS = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="KEY=VALUE", help="any other key by its path, e.g. rig.port=1502; may be given more than once"
+    ),
+]
+
+
 @app.command()
 def init(
     config: Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="file to write; never overwritten")],
@@ -92,65 +123,40 @@ def init(
     u_register: Annotated[
         str | None, typer.Option(metavar=REGISTER, help="Modbus register of u, e.g. holding:0:float32")
     ] = None,
-    registers: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--register",
-            metavar=f"NAME={REGISTER}",
-            help="any further register of the map, e.g. heartbeat=holding:2:uint16, enable=holding:20,bit=3,"
-            " gains.PB_percent=holding:30,scale=0.1; may be given more than once",
-        ),
-    ] = None,
-    model: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FILE|H(s)",
-            help=f"in place of --plant: a model file, or a transfer function as you write it, {EXAMPLE} or zpk([-1];"
-            " [-2, -3]; 4) or K=2 T=0.3,0.1 L=0.05, which becomes a model file beside the configuration",
-        ),
-    ] = None,
-    keys: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="KEY=VALUE",
-            help="any other key by its path, e.g. rig.port=1502; may be given more than once",
-        ),
-    ] = None,
-    y_span: Annotated[
-        tuple[float, float] | None, typer.Option(help="y at count 0 and at full scale of a microcontroller [y unit]")
-    ] = None,
-    u_span: Annotated[
-        tuple[float, float] | None, typer.Option(help="u at count 0 and at full scale of a microcontroller [u unit]")
-    ] = None,
-    sample_time: Annotated[
-        float | None, typer.Option(parser=number_of_option, metavar="NUMBER", help="control period [s]")
-    ] = None,
+    registers: _REGISTERS = None,
+    model: _MODEL = None,
+    keys: _KEYS = None,
+    y_span: Annotated[_Pair, typer.Option(help="y at count 0 and at full scale of a microcontroller [y unit]")] = None,
+    u_span: Annotated[_Pair, typer.Option(help="u at count 0 and at full scale of a microcontroller [u unit]")] = None,
+    sample_time: Annotated[float | None, _take_number("control period [s]")] = None,
     u_unit: Annotated[str | None, typer.Option(help="unit of the command")] = None,
     y_unit: Annotated[str | None, typer.Option(help="unit of the measurement")] = None,
-    u_range: Annotated[tuple[float, float] | None, typer.Option(help="lowest and highest command [u unit]")] = None,
-    u_safe: Annotated[
-        float | None,
-        typer.Option(parser=number_of_option, metavar="NUMBER", help="command the rig may be left with [u unit]"),
-    ] = None,
-    y_range: Annotated[
-        tuple[float, float] | None, typer.Option(help="lowest and highest y of the experiment [y unit]")
-    ] = None,
-    y: Annotated[
-        float | None, typer.Option(parser=number_of_option, metavar="NUMBER", help="y of the operating point [y unit]")
-    ] = None,
-    u: Annotated[
-        float | None,
-        typer.Option(parser=number_of_option, metavar="NUMBER", help="command that holds y there, about [u unit]"),
-    ] = None,
+    u_range: Annotated[_Pair, typer.Option(help="lowest and highest command [u unit]")] = None,
+    u_safe: Annotated[float | None, _take_number("command the rig may be left with [u unit]")] = None,
+    y_range: Annotated[_Pair, typer.Option(help="lowest and highest y of the experiment [y unit]")] = None,
+    y: Annotated[float | None, _take_number("y of the operating point [y unit]")] = None,
+    u: Annotated[float | None, _take_number("command that holds y there, about [u unit]")] = None,
 ) -> None:
     """Write a commented configuration; asks at a terminal for what no flag says."""
+    if config.exists():
+        raise InputError("exists already", where=str(config), remedy="choose another name; nothing is overwritten")
+    told: Table = {"u_unit": u_unit, "y_unit": y_unit, "sample_time_s": sample_time, "u_range": u_range}
+    told |= {"u_safe": u_safe, "y_range": y_range, "y": y, "u": u}
+    given: Table = {"host": host, "device": device, "recording": recording, "y_span": y_span, "u_span": u_span}
+    given |= {"endpoint": endpoint, "y_node": y_node, "u_node": u_node, "y_place": y_place, "u_place": u_place}
+    given |= {"y": y_register, "u": u_register, "registers": registers or ()}
+    _write_config(config, kind, plant, model, given, told, keys or ())
+
+
+def _write_config(
+    config: Path, kind: str | None, plant: Plant | None, model: str | None, given: Table, told: Table,
+    keys: Sequence[str],
+) -> None:  # fmt: skip
+    """Ask for what was not told of the rig and its signals, and write the configuration."""
     from autotune.config import Config, validate
     from autotune.config.rig import SimulatedRigSettings
     from drivers.kinds import KINDS
 
-    if config.exists():
-        raise InputError("exists already", where=str(config), remedy="choose another name; nothing is overwritten")
     questions = Questions()
     kinds = {one.name: one for one in KINDS}
     question = f"how is the rig reached ({', '.join(kinds)})"
@@ -165,17 +171,13 @@ def init(
         twin = questions.ask("--plant", twin, asked, _plant_or_model, suggested="ball")
         questions.require()
     answers: Table = {}
-    told: Table = {"u_unit": u_unit, "y_unit": y_unit, "sample_time_s": sample_time, "u_range": u_range}
-    told |= {"u_safe": u_safe, "y_range": y_range, "y": y, "u": u}
     if simulated and isinstance(twin, str):
         content = _simulated_config(twin, told)
     else:
-        given: Table = {"host": host, "device": device, "recording": recording, "y_span": y_span, "u_span": u_span}
-        given |= {"endpoint": endpoint, "y_node": y_node, "u_node": u_node, "y_place": y_place, "u_place": u_place}
-        reached = ask_rig(questions, chosen, given | {"y": y_register, "u": u_register})
-        if registers and not chosen.has_registers:
+        reached = ask_rig(questions, chosen, given)
+        if given["registers"] and not chosen.has_registers:
             raise InputError(f'kind = "{chosen.name}" has no registers', where="--register", remedy="leave it out")
-        add_registers(reached.get("registers", {}), registers or ())
+        add_registers(reached.get("registers", {}), given["registers"])
         if "twin" in chosen.settings.model_fields:
             asked = f"a twin for --dry-run: a transfer function such as {EXAMPLE}, a model file, or Enter for none"
             twin = questions.ask("--model", twin, asked, _plant_or_model, "") or None
@@ -186,7 +188,7 @@ def init(
         played = _settings_of_twin(twin, config, answers)
         content = config_of(reached | (played if simulated else {"twin": played} if played else {}), answers)
     content = {"name": config.stem, **content}
-    set_keys(content, keys or ())
+    set_keys(content, keys)
     validate(Config, content, str(config))
     place = Output(config)
     written = twin.write(config, answers) if isinstance(twin, ModelOfRig) else None
