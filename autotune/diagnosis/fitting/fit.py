@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
-from autotune.diagnosis.fitting.bases import basis, determined
+from autotune.diagnosis.fitting.bases import basis
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.descent import (
     Derivatives,
@@ -108,10 +108,10 @@ class Fit:
         """The same as ``explained`` for the start state of every window: (L, m) arrays."""
         return tuple(basis(self.jacobian[1][a:b]) for a, b in self.windows)
 
-    @cached_property
-    def states_told(self) -> int:
-        """How many of all windows' start states the residual tells, as many as ``states_explain`` has columns."""
-        return int(determined(self.jacobian[1], np.array(self.windows, dtype=np.int64)))
+    @property
+    def free_states(self) -> int:
+        """How many start states all windows have: each takes 1 of chi2 from noise alone, if it is felt at all."""
+        return len(self.windows) * int(self.jacobian[1].shape[1])
 
     def without_states(self, direction: FloatArray) -> FloatArray:
         """Return what is left of a whitened direction when all start states may move against it."""

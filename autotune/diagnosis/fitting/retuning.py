@@ -111,7 +111,7 @@ def floor_noise(noise: Noise, recordings: Sequence[Recording]) -> Noise:
 def reduced_chi2(result: Fit, data: Data) -> float:
     """Return the residual's variance in units of the noise that its own row-to-row jitter shows."""
     e = np.concatenate(under_noise(result, data).whitened(list(result.residuals)))
-    freedom = max(data.rows - result.states_told - result.theta.size, 1)
+    freedom = max(data.rows - result.free_states - result.theta.size, 1)
     return float(e @ e / freedom)
 
 

@@ -7,15 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from autotune.diagnosis.fitting.bases import basis, determined
 from autotune.diagnosis.fitting.data import Data
+from autotune.diagnosis.fitting.fit import fit
 from autotune.diagnosis.fitting.noise import Noise
+from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.selection.bench import at_once
 from autotune.diagnosis.selection.chain_proposals import search_chain
+from autotune.diagnosis.selection.hypothesis import hypothesis
 from autotune.diagnosis.simulation.assembly import assemble
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.effects import ALL
-from autotune.models import Block, Model, Port, TransferFunction
+from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
 from autotune.recording import Recording
 
 ROWS, WINDOW = 3000, 50
@@ -48,16 +50,17 @@ def cut(recording: Recording) -> Data:
     )  # fmt: skip
 
 
-@given(st.integers(0, 2**32 - 1), st.lists(st.integers(3, 30), min_size=1, max_size=6), st.integers(1, 3))
-def test_as_many_start_states_are_told_as_span_what_they_explain(seed: int, lengths: list[int], states: int) -> None:
-    random = np.random.default_rng(seed)
-    edges = np.cumsum([0, *lengths])
-    windows, Jx = np.column_stack([edges[:-1], edges[1:]]), random.normal(size=(int(edges[-1]), states))
-    for number, (a, b) in enumerate(windows):
-        Jx[a:b, states - number % states :] = 0.0  # not felt
-        if number % 2:
-            Jx[a:b] = Jx[a:b, :1]  # all alike
-    assert determined(Jx, windows) == sum(basis(Jx[a:b]).shape[1] for a, b in windows)
+@pytest.mark.parametrize("lag_s", [1e-1, 1e-4, 1e-9])
+def test_a_sensor_s_start_states_are_paid_for_however_little_they_are_felt(lag_s: float) -> None:
+    """Else a lag of a nanosecond, which does nothing, would come cheaper than one that does."""
+    data = cut(recorded())
+    sensor = Effect(name="sensor.lag", parameters={"time_constant": Parameter(value=lag_s)})
+    alone, beside = (
+        hypothesis(fit(parametrise(lag(), added, 1.0, 0.05, IN_USE.prior_spread), data, iterations=0))
+        for added in ([], [sensor])
+    )
+    paid = beside.penalised_chi2 - beside.fit.cost - (alone.penalised_chi2 - alone.fit.cost)
+    assert paid == pytest.approx(np.log(ROWS) + ROWS / WINDOW)  # a number, and a state in every window
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.5]))
