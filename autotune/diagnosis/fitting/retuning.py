@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from autotune.arrays import BoolArray
+from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
 from autotune.diagnosis.fitting.noise import Noise, autoregressive_up_to, noise_from_differences
@@ -93,6 +93,22 @@ def _straightened(result: Fit, data: Data) -> Fit:
 def under_noise(result: Fit, data: Data) -> Data:
     """Return data with the noise that the row-to-row jitter of a fit's residual shows."""
     return replace(data, noise=floor_noise(noise_from_differences(result.residuals, data.good), data.recordings))
+
+
+def is_unfelt(result: Fit, change: FloatArray, data: Data) -> bool:
+    """Whether a fit could do without what changes its residual: by less than one row's noise beyond start states.
+
+    A lag of nanoseconds frees the first reading of every window, and does nothing else.
+
+    Parameters
+    ----------
+    result, data
+        A fit, and what it was fitted to.
+    change : (N,) array
+        Of the whitened residual, at the same numbers.
+    """
+    left, least = result.without_states(change), under_noise(result, data).noise.total_sd / data.noise.sd
+    return float(left @ left) < least**2
 
 
 def far_from_prior(result: Fit, sds: float) -> bool:
