@@ -182,8 +182,7 @@ class Evidence(ABC):
         try:
             there = self.again(part, [name for name in KINDS if name not in seen], known)
             if best is not None and there.found is not None:
-                asked = ((there.found.without(effect.name, best.names), effect) for effect in best.added)
-                untold = untold.union(*(others.unfelt([effect]) for others, effect in asked))
+                untold |= there.found.retuned.unfelt(best.added)
         except InputError:  # nothing runs there
             return None, ()
         return there, untold
