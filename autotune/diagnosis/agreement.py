@@ -91,13 +91,14 @@ def agreement(
     -------
     mapping of str to float
         The geometric mean over all rows and the parts that tell of an effect, where it is at least so much: what a part
-        contradicts is not named, however sure the others are. What they confirm has its odds in full.
+        contradicts is not named, however sure the others are. What every part confirms has its odds in full.
 
     Notes
     -----
     One search is cooled, for its likelihood of these rows is too sure (``temperature``). Whether other rows say the
     same is what the parts were asked: what is likelier than not by all of them is stated with its odds in full, so that
-    the same effects are named. What they do not confirm stays as open as it was.
+    the same effects are named. What one of them cannot tell, as a step before it begins, stays as open as it was: the
+    other one has four fifths of the same rows.
 
     References
     ----------
@@ -109,7 +110,7 @@ def agreement(
         all_said = [whole, *(one for part, one in zip(parts, said, strict=True) if tells(part, begins.get(name, ())))]
         told = [max(p, LEAST) for p in (one.get(name, 0.0) for one in all_said) if not math.isnan(p)]
         mean = float(np.exp(np.mean(np.log(told))))
-        probability = undo_cooling(mean, limits) if mean >= NAMED and len(told) > 1 else mean
+        probability = undo_cooling(mean, limits) if mean >= NAMED and 1 < len(told) > len(parts) else mean
         if probability >= least:
             agreed[name] = probability
     return agreed

@@ -182,7 +182,8 @@ class Evidence(ABC):
         try:
             there = self.again(part, [name for name in KINDS if name not in seen], known)
             if best is not None and there.found is not None:
-                untold |= there.found.retuned.unfelt(best.added)
+                asked = ((there.found.without(effect.name, best.names), effect) for effect in best.added)
+                untold = untold.union(*(others.unfelt([effect]) for others, effect in asked))
         except InputError:  # nothing runs there
             return None, ()
         return there, untold

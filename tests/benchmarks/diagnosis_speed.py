@@ -78,7 +78,7 @@ def _run_s(case: Case) -> float:
     model, recordings = case
     sim, rest, times = assemble(model), [], 20
     for r in recordings:
-        rest.append(sim.rest_state(float(r.u[0]), float(r.y[0])))
+        rest.append(sim.rest_state(float(r.u[0]), float(r.y[0]), r.sample_time_s))
         sim.run(r, rest[-1], signals=1)
     begin = time.process_time()
     for _ in range(times):

@@ -58,7 +58,7 @@ def held_out_error(retuned: Fit, data: Data, *, tune: bool) -> float:
     with ThreadPoolExecutor(2) as pool:
         fits = list(pool.map(lambda pair: _tested(retuned, tune, *pair), (halves, halves[::-1])))
     squares = sum(float(e @ e) for f in fits for e in f.residuals)
-    freedom = sum(f.rows - f.states_told for f in fits)
+    freedom = sum(f.rows - f.free_states for f in fits)
     return math.sqrt(squares / max(freedom, 1)) / spread_of(data)
 
 

@@ -92,7 +92,7 @@ def late_rows(retuned: Fit, data: Data) -> SampleEffect | None:
     if not sim.is_linear or variance <= 0.0 or sim.linear_hold:
         return None
     recordings = [_rows(retuned, data, i) for i in range(len(data.recordings))]
-    spread = sim.state_sizes(*data.spans)
+    spread = data.state_sizes(sim)
     dt = data.sample_times[0]
 
     def told(correlation: float, jitter: float, load: float = 0.0) -> _Told:

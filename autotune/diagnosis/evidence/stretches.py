@@ -187,7 +187,7 @@ def error_beside_still(result: Fit, data: Data) -> float | None:
 def _left_out(result: Fit, data: Data) -> Iterator[tuple[BoolArray, Iterate | None, Problem]]:
     """Yield each stretch's rows, and where a fit to the others goes; None where it runs away."""
     problem = Problem(result.parametrisation, data)
-    problem.scales = result.sim.state_sizes(*data.spans)
+    problem.scales = data.state_sizes(result.sim)
     start = problem.iterate(result.theta, [x.copy() for x in result.x0])
     J, Jx = result.jacobian[0], problem.jacobian(start, np.zeros(result.theta.size, dtype=bool))[1]
     for labels in cuttings_of(data):

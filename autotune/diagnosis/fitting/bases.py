@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-from numba import njit
 
-from autotune.arrays import FloatArray, IntArray
+from autotune.arrays import FloatArray
 
 #: Norm of a derivative that is none, and share of the largest eigenvalue up to which a direction is not determined.
 NOT_FELT, UNTOLD = 1e-9, 1e-8
@@ -26,23 +23,3 @@ def basis(J: FloatArray, prior: FloatArray | None = None) -> FloatArray:
     values, vectors = np.linalg.eigh(H)
     keep = values > UNTOLD * values[-1]
     return np.asarray(scaled @ (vectors[:, keep] / np.sqrt(values[keep])))
-
-
-@njit(cache=True, nogil=True)
-def determined(Jx: FloatArray, windows: IntArray) -> int:
-    """Return how many columns :func:`basis` has of every window's rows, all windows (W, 2) together."""
-    count = 0
-    norms = np.empty(Jx.shape[1])
-    for first, last in windows:
-        X = Jx[first:last]
-        for i in range(norms.size):
-            norms[i] = math.sqrt(np.sum(X[:, i] ** 2))
-        felt = np.flatnonzero(norms > NOT_FELT)
-        if felt.size == 0:
-            continue
-        scaled = np.empty((X.shape[0], felt.size))
-        for i in range(felt.size):
-            scaled[:, i] = X[:, felt[i]] / norms[felt[i]]
-        values = np.linalg.eigvalsh(scaled.T @ scaled)
-        count += int(np.sum(values > UNTOLD * values[-1]))
-    return count

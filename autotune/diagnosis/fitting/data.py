@@ -12,7 +12,7 @@ from numba import njit
 from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.fitting.noise import Noise
 from autotune.diagnosis.simulation.assembly import spans_of
-from autotune.diagnosis.simulation.simulator import Windows
+from autotune.diagnosis.simulation.simulator import Simulator, Windows
 from autotune.diagnosis.thresholds import Thresholds
 from autotune.recording import Recording
 
@@ -205,6 +205,10 @@ class Data:
     def sample_times(self) -> tuple[float, ...]:
         """Sample time of every recording [s]."""
         return tuple(r.sample_time_s for r in self.driving)
+
+    def state_sizes(self, sim: Simulator) -> FloatArray:
+        """Return a size for every state of a simulated chain, (n,), see there."""
+        return sim.state_sizes(*self.spans, min(self.sample_times))
 
     def whitened(self, residuals: list[FloatArray]) -> list[FloatArray]:
         """Return the residuals whitened by the noise model, zero where a row or one that it needs does not count."""

@@ -175,9 +175,8 @@ def _freed(left: FloatArray, Jx: FloatArray, first: IntArray, last: IntArray, da
         X, Y = Jx[first[w] : last[w]], left[first[w] : last[w]]
         G = X.T @ X
         # a little of the prior that start states are of the signals' size keeps unfelt ones in place
-        least = 1e-2 + 1e-10 * np.trace(G)
         for i in range(n):
-            G[i, i] += damping * G[i, i] + least
+            G[i, i] += 1e-2 + (damping + 1e-10) * G[i, i]
         gains[w] = np.linalg.solve(G, X.T @ Y)
         Y -= X @ gains[w]
     return gains

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from autotune.arrays import BoolArray, FloatArray, IntArray
-from autotune.diagnosis.fitting.bases import basis, determined
+from autotune.diagnosis.fitting.bases import basis
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.descent import (
     Derivatives,
@@ -108,10 +108,10 @@ class Fit:
         """The same as ``explained`` for the start state of every window: (L, m) arrays."""
         return tuple(basis(self.jacobian[1][a:b]) for a, b in self.windows)
 
-    @cached_property
-    def states_told(self) -> int:
-        """How many of all windows' start states the residual tells, as many as ``states_explain`` has columns."""
-        return int(determined(self.jacobian[1], np.array(self.windows, dtype=np.int64)))
+    @property
+    def free_states(self) -> int:
+        """How many start states all windows have: each takes 1 of chi2 from noise alone, if it is felt at all."""
+        return len(self.windows) * int(self.jacobian[1].shape[1])
 
     def without_states(self, direction: FloatArray) -> FloatArray:
         """Return what is left of a whitened direction when all start states may move against it."""
@@ -142,13 +142,13 @@ class Fit:
 def start_states(sim: Simulator, data: Data) -> list[FloatArray]:
     """Return a first guess of every window's start state: rest at the row's command and reading."""
     result = []
-    rows = zip(data.recordings, data.good, data.starts, data.driving, data.first_rows, strict=True)
-    for recording, good, starts, driving, first in rows:
+    rows = zip(data.recordings, data.good, data.starts, data.driving, data.first_rows, data.sample_times, strict=True)
+    for recording, good, starts, driving, first, dt in rows:
         y = np.empty(starts.size)
         for k, s in enumerate(starts):
             near = good[s : s + 20]
             y[k] = recording.y[s + int(near.argmax())] if near.any() else float(np.mean(recording.y[good]))
-        result.append(sim.rest_states(driving.u[np.maximum(first - 1, 0)], y))
+        result.append(sim.rest_states(driving.u[np.maximum(first - 1, 0)], y, dt))
     return result
 
 
@@ -226,7 +226,7 @@ def fit(
     point = parametrisation.centre.copy() if theta is None else theta.copy()
     problem = Problem(parametrisation, data)
     sim = parametrisation.simulator(point)
-    problem.scales = sim.state_sizes(*data.spans)
+    problem.scales = data.state_sizes(sim)
     fits_in = x0 is not None and x0[0].shape[1] == sim.order
     states = [x.copy() for x in x0] if x0 is not None and fits_in else start_states(sim, data)
     may = np.ones(point.size, dtype=bool) if free is None else free

@@ -85,3 +85,30 @@ def cut(
     )  # fmt: skip
     data = data.thinned(limits.rig_rows)
     return as_white(data, spread_of(data))
+
+
+def within(known: Data, recordings: Sequence[Recording], good: Sequence[BoolArray]) -> Data:
+    """Return parts of recordings in the windows that all their rows were cut into, as far as these lie in them.
+
+    A fit of all rows has a state in every row there, so that one of the part goes on where that simulation is.
+
+    Parameters
+    ----------
+    known : Data
+        All rows in windows, some of which may have been left out.
+    recordings, good
+        The parts, their rows numbered as there, and which of them count.
+    """
+    starts, stops = [], []
+    for r, windows in zip(recordings, known.windows, strict=True):
+        first, last = np.maximum(windows.starts, r.first_reading), np.minimum(windows.stops, len(r))
+        most = 2 * (last - first) >= windows.stops - windows.starts
+        able = most if most.any() else last > first
+        starts.append(first[able])
+        stops.append(last[able])
+    data = Data(
+        recordings=tuple(recordings), good=tuple(good), starts=tuple(starts), stops=tuple(stops), noise=Noise(sd=1.0),
+        thresholds=known.thresholds,
+    )  # fmt: skip
+    data = data.only([np.ones(first.size, dtype=bool) for first in starts])
+    return as_white(data, spread_of(data))

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from autotune.arrays import BoolArray
+from autotune.arrays import BoolArray, FloatArray
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import RUNAWAY, Fit, fit
 from autotune.diagnosis.fitting.noise import Noise, autoregressive_up_to, noise_from_differences
@@ -95,6 +95,22 @@ def under_noise(result: Fit, data: Data) -> Data:
     return replace(data, noise=floor_noise(noise_from_differences(result.residuals, data.good), data.recordings))
 
 
+def is_unfelt(result: Fit, change: FloatArray, data: Data) -> bool:
+    """Whether a fit could do without what changes its residual: by less than one row's noise beyond start states.
+
+    A lag of nanoseconds frees the first reading of every window, and does nothing else.
+
+    Parameters
+    ----------
+    result, data
+        A fit, and what it was fitted to.
+    change : (N,) array
+        Of the whitened residual, at the same numbers.
+    """
+    left, least = result.without_states(change), under_noise(result, data).noise.total_sd / data.noise.sd
+    return float(left @ left) < least**2
+
+
 def far_from_prior(result: Fit, sds: float) -> bool:
     """Whether retuning moved a gain or lag by more than some of its prior's standard deviations."""
     away = np.abs(result.theta - result.parametrisation.centre) / result.parametrisation.spreads
@@ -111,7 +127,7 @@ def floor_noise(noise: Noise, recordings: Sequence[Recording]) -> Noise:
 def reduced_chi2(result: Fit, data: Data) -> float:
     """Return the residual's variance in units of the noise that its own row-to-row jitter shows."""
     e = np.concatenate(under_noise(result, data).whitened(list(result.residuals)))
-    freedom = max(data.rows - result.states_told - result.theta.size, 1)
+    freedom = max(data.rows - result.free_states - result.theta.size, 1)
     return float(e @ e / freedom)
 
 

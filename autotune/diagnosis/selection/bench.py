@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Self, TypeVar
 
 from autotune.arrays import FloatArray
 from autotune.diagnosis.evidence.stretches import correlation_rows, held_out_squares, rms
 from autotune.diagnosis.fitting.data import Data, as_white
-from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, fit_from, states_in
+from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, fit_from, residual_at, states_in
 from autotune.diagnosis.fitting.long_windows import spread_of
 from autotune.diagnosis.fitting.parameters import Parametrisation
 from autotune.diagnosis.fitting.restarts import realign_effects
+from autotune.diagnosis.fitting.retuning import is_unfelt
 from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
 from autotune.diagnosis.selection.judged_chain import JudgedChain
 from autotune.diagnosis.simulation.assembly import states_that_stay
@@ -130,7 +132,7 @@ class Bench:
         Where it leaves far less than the residual that it was fitted at, it is fitted again first, and again until it
         does not: priors weighed too much, beside rows that tell more than they were taken to.
         """
-        if is_stand_in(hypothesis(result), self.long):
+        if names_more_than_it_is(result, self.long):
             return None
         bench = self
         try:
@@ -157,8 +159,8 @@ class Bench:
         )
 
 
-def fit_without(result: Fit, index: int, data: Data) -> Fit | None:
-    """Fit again without one of the effects that a fit adds; nothing where the simulation runs away without it."""
+def _left_out(result: Fit, index: int) -> tuple[Parametrisation, FloatArray, list[FloatArray]]:
+    """Return parametrisation, numbers and start states of a fit without one of the effects that it adds."""
     p = result.parametrisation
     index += p.own  # the nominal model's own effects stay
     keep = [i for i, f in enumerate(p.free) if f.kind != "effect" or f.index[0] != index]
@@ -167,12 +169,44 @@ def fit_without(result: Fit, index: int, data: Data) -> Fit | None:
         for f in (p.free[i] for i in keep)
     ]
     effects = tuple(e for i, e in enumerate(p.model.effects) if i != index)
-    x0 = [x[:, states_that_stay(p.model.effects[index].name, x.shape[1])] for x in result.x0]
     smaller = replace(p, model=replace(p.model, effects=effects), free=tuple(moved), centre=p.centre[keep])
+    theta = result.theta[keep]
+    stay = states_that_stay(p.model.effects[index].name, result.sim.order, smaller.simulator(theta).order)
+    return smaller, theta, [x[:, stay] for x in result.x0]
+
+
+def fit_without(result: Fit, index: int, data: Data) -> Fit | None:
+    """Fit again without one of the effects that a fit adds; nothing where the simulation runs away without it."""
     try:
-        return fit(smaller, data, result.theta[keep], x0, iterations=20, rounds=2)
+        p, theta, x0 = _left_out(result, index)
+        return fit(p, data, theta, x0, iterations=20, rounds=2)
     except RUNAWAY:
         return None
+
+
+def names_more_than_it_is(result: Fit, data: Data) -> bool:
+    """Whether one of a fit's effects is a simpler one by its numbers, or does nothing.
+
+    What a lag of nanoseconds comes with are numbers that the fit without it has not found: what it gains is theirs.
+
+    Parameters
+    ----------
+    result, data
+        A fit with the effects that it adds, and what it was fitted to.
+    """
+    p = result.parametrisation
+
+    def is_felt(index: int) -> bool:
+        own = [i for i, f in enumerate(p.free) if f.kind == "effect" and f.index[0] == index + p.own]
+        # under a constant command all that a lag does is how its start state decays: its number shows there
+        if not all(is_unfelt(result, result.jacobian[0][:, i], data) for i in own):
+            return True
+        with suppress(*RUNAWAY):
+            fewer, theta, x0 = _left_out(result, index)
+            return not is_unfelt(result, residual_at(fewer, data, theta, tuple(x0)) - result.e, data)
+        return True
+
+    return is_stand_in(hypothesis(result), data) or not all(map(is_felt, range(len(p.added))))
 
 
 def residual_sd(result: Fit, data: Data) -> float:

@@ -18,11 +18,10 @@ from autotune.arrays import BoolArray
 from autotune.diagnosis.evidence.operating_point import unmoved
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, states_in
-from autotune.diagnosis.fitting.long_windows import cut, lengths_of
+from autotune.diagnosis.fitting.long_windows import cut, lengths_of, within
 from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.fitting.restarts import realign_effects
-from autotune.diagnosis.selection.bench import Bench, at_once, fit_without, residual_sd
-from autotune.diagnosis.selection.hypothesis import hypothesis, is_stand_in
+from autotune.diagnosis.selection.bench import Bench, at_once, fit_without, names_more_than_it_is, residual_sd
 from autotune.diagnosis.selection.judged import each_best, rank
 from autotune.diagnosis.selection.judged_chain import JudgedChain, at_both_scales
 from autotune.diagnosis.selection.prediction import distinct_starts, extend, predictions, signal_sizes, starting_effects
@@ -75,10 +74,12 @@ def search_chain(
     with ThreadPoolExecutor(2) as pool:
         progress("retuning on long windows", 0.0)
         lengths = lengths_of(model, recordings, limits)
-        bench = Bench(
-            cuts=tuple(cut(model, recordings, good, length, limits) for length in lengths.between),
-            few=cut(model, recordings, good, lengths.short, limits), odds=_odds(model, recordings, left_out), pool=pool,
-        )  # fmt: skip
+        cuts = [cut(model, recordings, good, length, limits) for length in lengths.between]
+        few = cut(model, recordings, good, lengths.short, limits)
+        if known:
+            cuts[-1] = within(known[0].data, recordings, good)
+            few = within(known[0].few, recordings, good) if len(cuts) == 1 else few
+        bench = Bench(cuts=tuple(cuts), few=few, odds=_odds(model, recordings, left_out), pool=pool)
         return search(_begin(model, bench), progress, known)
 
 
@@ -297,6 +298,6 @@ def _fit_added(start: _Start) -> Fit | None:
             continue
         if start.kind.moves is not None:
             result = realign_effects(result, bench.long)
-        if not is_stand_in(hypothesis(result), bench.long):
+        if not names_more_than_it_is(result, bench.long):
             done.append(result)
     return min(done, key=lambda f: f.cost, default=None)

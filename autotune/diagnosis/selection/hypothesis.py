@@ -30,7 +30,7 @@ class Hypothesis:
 
         A block that an effect adds brings start states to every window, each of which takes 1 of chi2 from noise alone.
         """
-        return float(self.fit.cost + self.parameters * np.log(self.fit.rows) + self.fit.states_told)
+        return float(self.fit.cost + self.parameters * np.log(self.fit.rows) + self.fit.free_states)
 
 
 def hypothesis(fit: Fit) -> Hypothesis:

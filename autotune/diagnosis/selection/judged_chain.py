@@ -18,7 +18,7 @@ from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import LAST_STEPS, RUNAWAY, STEPS, Fit, fit, residual_at, states_in
 from autotune.diagnosis.fitting.levels import sweep
 from autotune.diagnosis.fitting.long_windows import spread_of
-from autotune.diagnosis.fitting.retuning import reduced_chi2, under_noise
+from autotune.diagnosis.fitting.retuning import is_unfelt, reduced_chi2, under_noise
 from autotune.diagnosis.fitting.spreading import spread_out
 from autotune.diagnosis.selection.hypothesis import Hypothesis
 from autotune.diagnosis.selection.judged import Judged, total
@@ -105,14 +105,14 @@ class JudgedChain(Judged):
 
     def unfelt(self, effects: Sequence[Effect]) -> frozenset[str]:
         """Return the effects that would change what is read by less than one row's noise does."""
-        names, least = set(), (under_noise(self.fit, self.data).noise.total_sd / self.data.noise.sd) ** 2
+        names = set()
         for effect in effects:
             p, theta, states = extend(self.fit, effect, self.data)
             try:
                 change = residual_at(p, self.data, theta, states) - self.fit.e
             except RUNAWAY:
                 continue
-            if float(change @ change) < least:
+            if is_unfelt(self.fit, change, self.data):
                 names.add(effect.name)
         return frozenset(names)
 

@@ -165,7 +165,7 @@ def _added_states(base: Fit, effect: Effect, problem: Problem, there: Iterate) -
     part = kind_of(effect.name).linear
     if part is None or added <= 0:
         return np.empty((there.e.size, 0))
-    problem.scales = there.sim.state_sizes(*problem.data.spans)
+    problem.scales = problem.data.state_sizes(there.sim)
     columns = problem.state_columns(there, range(added) if part.at == "front" else range(order - added, order))
     return np.column_stack([base.without_states(column) for column in columns.T])
 

@@ -100,6 +100,22 @@ class Found(Generic[_J]):
         """All hypotheses with effects, first the one that the least speaks against."""
         return tuple(sorted((j for j in self.judged if j.names), key=lambda j: j.behind(self.chosen)))
 
+    def without(self, name: str, names: Sequence[str]) -> _J:
+        """Return the hypothesis of the other ones of some effects, the retuned model where there is none.
+
+        What an effect does shows beside the others: a lag of the sensor where a stop makes the motion fast.
+
+        Parameters
+        ----------
+        name : str
+            The effect that is left out.
+        names : sequence of str
+            All of them.
+        """
+        others = {*names} - {name}
+        able = rank([one for one in self.others if {*one.names} == others])
+        return able[0] if able else self.retuned
+
     def quality(self, noise_floor: float) -> FitQuality:
         """Return errors on rows that were not fitted, beside the noise as a share of the spread of y."""
         nominal, retuned, extended = (one.error for one in (self.nominal, self.retuned, self.chosen))

@@ -145,12 +145,18 @@ def _require_possible(effect: Effect, values: Mapping[str, float], model: Model)
         raise InputError(wrong, where=model.name, remedy=f"leave {kind.name} out")
 
 
-def states_that_stay(name: str, order: int) -> slice:
-    """Return the states that stay when an effect is taken out of a chain of an order: all but those of its block."""
+def states_that_stay(name: str, order: int, fewer: int) -> slice:
+    """Return the states that stay when an effect is taken out of a chain: all but those of its block, if it has one.
+
+    Parameters
+    ----------
+    name : str
+        The effect.
+    order, fewer : int
+        States of the chain with it, and without it.
+    """
     part = KINDS[name].linear
-    if part is None or part.unless_lagged:
-        return slice(0, order)
-    return slice(part.states, order) if part.at == "front" else slice(0, order - part.states)
+    return slice(order - fewer, order) if part is not None and part.at == "front" else slice(0, fewer)
 
 
 def input_size(model: Model, recordings: Sequence[Recording]) -> float:

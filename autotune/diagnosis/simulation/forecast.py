@@ -39,7 +39,7 @@ class _Chain:
 
     def rest(self, row: int, reading: float) -> FloatArray:
         """See there."""
-        return self.sim.rest_state(float(self.recording.u[max(row - 1, 0)]), reading)
+        return self.sim.rest_state(float(self.recording.u[max(row - 1, 0)]), reading, self.dt_s)
 
     def run(self, first: int, last: int, state: FloatArray, force: float) -> tuple[FloatArray, FloatArray]:
         """See there."""
@@ -84,7 +84,7 @@ def forecast(model: Model, recording: Recording, horizon_s: float | None = None)
     plant = _Chain(
         sim=sim,
         recording=recording,
-        sizes=sim.state_sizes(*spans_of([recording.u], [recording.y[good]])),
+        sizes=sim.state_sizes(*spans_of([recording.u], [recording.y[good]]), recording.sample_time_s),
         force_size=input_size(model, [recording]),
         dt_s=recording.sample_time_s,
     )

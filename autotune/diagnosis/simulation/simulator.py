@@ -196,27 +196,33 @@ class Simulator:
         told = _told(self.kinds, self.linear_hold, self.falling is not self.chain, self.order, where)
         return np.concatenate([told, self.acts])
 
-    def rest_state(self, u: float, y: float) -> FloatArray:
+    def rest_state(self, u: float, y: float, sample_time_s: float) -> FloatArray:
         """Return the state nearest to rest under a command that gives a reading.
 
         Parameters
         ----------
         u, y : float
             Command and reading, absolute.
+        sample_time_s : float
+            Rates beyond one over it count as that: a lag of a nanosecond moves no other state.
 
         Returns
         -------
         (n,) array
             For an integrating chain at rest but for its reading; else the linear equilibrium, shifted to the reading.
         """
-        return np.asarray(self.rest_states(np.array([u]), np.array([y]))[0])
+        return np.asarray(self.rest_states(np.array([u]), np.array([y]), sample_time_s)[0])
 
-    def rest_states(self, u: FloatArray, y: FloatArray) -> FloatArray:
-        """Return the states, (W, n), nearest to rest under commands, (W,), that give readings, (W,)."""
+    def rest_states(self, u: FloatArray, y: FloatArray, sample_time_s: float) -> FloatArray:
+        """Return the states, (W, n), nearest to rest under commands, (W,), that give readings, (W,).
+
+        See :meth:`rest_state` for the sample time.
+        """
         # least squares of: A x = -B w, and weighted: output = aim
         wrong = np.vstack([np.outer(-self.chain.B[:, 0], u - self.u_offset), y - self.y_offset])
         lhs = np.vstack([self.chain.A, self.chain.taps[kernel.OUTPUT]])
-        return np.ascontiguousarray(self._balanced(lhs, wrong, weight=1e3)[: self.order].T)
+        sizes = self._answer(1.0 / sample_time_s)
+        return np.ascontiguousarray(self._balanced(lhs, wrong, sizes, weight=1e3)[: self.order].T)
 
     def rest_at(self, y: float) -> tuple[FloatArray, float]:
         """Return the state, (n,), and the command from the operating point [u unit] of rest at a reading [y unit].
@@ -228,21 +234,22 @@ class Simulator:
         """
         chain = self.chain
         lhs = np.block([[chain.A, chain.B[:, :1]], [chain.taps[kernel.OUTPUT], chain.gains[3:4]]])
-        rest = self._balanced(lhs, np.append(np.zeros(self.order), y - self.y_offset)[:, None])[:, 0]
+        aim = np.append(np.zeros(self.order), y - self.y_offset)[:, None]
+        rest = self._balanced(lhs, aim, self._answer())[:, 0]
         return rest[: self.order], float(rest[self.order])
 
-    def _balanced(self, lhs: FloatArray, rhs: FloatArray, weight: float = 1.0) -> FloatArray:
+    def _balanced(self, lhs: FloatArray, rhs: FloatArray, sizes: FloatArray, weight: float = 1.0) -> FloatArray:
         """Return a least-squares solution, states in their own sizes and rows in theirs, the last one weighted.
 
         The units of the signals would decide else what gives way where not all can be.
         """
-        sizes = np.append(np.where(self._answer > 0.0, self._answer, 1.0), 1.0)[: lhs.shape[1]]
+        sizes = np.append(np.where(sizes > 0.0, sizes, 1.0), 1.0)[: lhs.shape[1]]
         scale = np.abs(lhs * sizes).max(axis=1, keepdims=True)
         scale[scale == 0.0] = 1.0
         scale[-1] /= weight
         return np.asarray(sizes[:, None] * np.linalg.lstsq(lhs * sizes / scale, rhs / scale, rcond=1e-12)[0])
 
-    def state_sizes(self, span: float, spread: float) -> FloatArray:
+    def state_sizes(self, span: float, spread: float, sample_time_s: float) -> FloatArray:
         """Return a size for every state: what the command's span makes of it, bounded by what the readings show.
 
         Parameters
@@ -250,27 +257,30 @@ class Simulator:
         span, spread : float
             Of all recordings, see :func:`autotune.diagnosis.simulation.assembly.spans_of`. Where no command moves, a
             state has the size that moves the reading by its spread, by free motion from there.
+        sample_time_s : float
+            Of all recordings the shortest; rates beyond one over it count as that, as of :meth:`rest_state`.
         """
-        tap = self.chain.taps[kernel.OUTPUT]
+        tap, resolved = self.chain.taps[kernel.OUTPUT], 1.0 / sample_time_s
         if span == 0.0 < spread:
-            times = np.concatenate([[0.0], np.geomspace(0.05, 5.0, 8) / self._fastest])
+            times = np.concatenate([[0.0], np.geomspace(0.05, 5.0, 8) / min(self._fastest, resolved)])
             moved = np.max([np.abs(tap @ expm(self.chain.A * t)) for t in times], axis=0)
             return np.asarray(spread / np.maximum(moved, 1e-12 * max(float(moved.max()), 1e-300)))
-        states, read = self._answer * span, tap != 0.0
+        states, read = self._answer(resolved) * span, tap != 0.0
         if spread > 0.0:
             states[read] = np.minimum(states[read], spread / np.abs(tap[read]))
         return np.where(states == 0.0, 1.0, states)
 
-    @cached_property
-    def _answer(self) -> FloatArray:
-        """What commands of one make of the states, (n,): those that stay, and those that grow as fast as states move.
+    def _answer(self, resolved: float = math.inf) -> FloatArray:
+        """Return what commands of one make of the states, (n,): ones that stay, ones that grow as fast as states move.
 
-        |(s I - A)^-1 B| at s a thousandth of the fastest rate (an integrator answers ever more) and past every rate: a
-        speed is as large as its position's rate, and not as small as what a constant command leaves of it.
+        |(s I - A)^-1 B| at s a thousandth of the fastest rate that is resolved [1/s] (an integrator answers ever more)
+        and past every rate: a speed is as large as its position's rate, and not as small as what a constant command
+        leaves of it.
         """
         A, b = self.chain.A, self.chain.B[:, 0]
         rates = np.abs(np.linalg.eigvals(A))
-        grows = np.append(GROWTH * rates[rates > SLOWEST * self._fastest], SLOWEST * self._fastest)
+        least = SLOWEST * min(self._fastest, resolved)
+        grows = np.append(GROWTH * rates[rates > least], least)
         found = [np.abs(np.linalg.solve(s * np.eye(self.order) - A, b)) for s in grows]
         return np.asarray(np.max(found, axis=0))
 
@@ -280,7 +290,7 @@ class Simulator:
         return float(np.abs(np.linalg.eigvals(self.chain.A)).max(initial=0.0)) or 1.0
 
 
-#: Rates at which a command grows that states are sized by: the least, of the fastest rate, and factor on every rate.
+#: Rates at which a command grows that states are sized by: the least, of the fastest one, and factor on every rate.
 SLOWEST, GROWTH = 1e-3, 1.3
 _FORCED: tuple[StageName, ...] = tuple(name for name, stage in STAGES.items() if stage.is_force)
 #: Stages that the body asks for one by one.

@@ -13,8 +13,8 @@ import pytest
 from autotune.diagnosis.agreement import LEFT_OUT, Begins, agreement, parts_of, tells
 from autotune.diagnosis.evidence.stretches import rms
 from autotune.diagnosis.fitting.data import as_white
-from autotune.diagnosis.fitting.fit import fit_from
-from autotune.diagnosis.fitting.long_windows import cut
+from autotune.diagnosis.fitting.fit import fit, fit_from, states_in
+from autotune.diagnosis.fitting.long_windows import cut, within
 from autotune.diagnosis.fitting.parameters import parametrise
 from autotune.diagnosis.thresholds import IN_USE
 from autotune.models import Block, Effect, Model, Parameter, Port, TransferFunction
@@ -62,6 +62,32 @@ def test_what_was_commanded_before_a_part_begins_acts_in_it() -> None:
         assert rms(there.residuals, data.good) < 1.1 * sd
 
 
+@pytest.mark.parametrize("thinned", [False, True])
+def test_a_part_is_judged_in_the_windows_of_all_rows_from_the_states_that_these_have(thinned: bool) -> None:
+    rng, rows = np.random.default_rng(3), 2000
+    u, y = rng.normal(size=rows).cumsum() * 0.1, np.empty(rows)
+    state = 0.0
+    for k in range(rows):
+        y[k] = state + 0.01 * rng.normal()
+        state += 0.1 * (u[k] - state)
+    recording = Recording(t=0.1 * np.arange(rows), u=u, y=y)
+    block = Block(name="p", place="plant", dynamics=TransferFunction(num=(1.0,), den=(1.0, 1.0)))
+    model = Model(name="m", input=Port(), output=Port(), blocks=(block,))
+    every = cut(model, (recording,), [np.ones(rows, dtype=bool)], 11.0, IN_USE)
+    known = every.only([np.arange(every.starts[0].size) % 3 > 0]) if thinned else every
+    all_rows = fit(parametrise(model, [], float(np.std(u)), 0.1, IN_USE.prior_spread), known)
+    told = np.full(rows, np.nan)
+    told[known.kept[0] if thinned else slice(None)] = np.where(known.good[0], all_rows.residuals[0], np.nan)
+    for part in parts_of((recording,), 100):
+        there = within(known, part, [np.isfinite(r.y) for r in part])
+        begun, none = states_in(all_rows, known, there), np.zeros(all_rows.theta.size, dtype=bool)
+        begins = fit(all_rows.parametrisation, there, all_rows.theta, begun, free=none, iterations=0)
+        numbers = there.kept[0] if there.whole is not None else np.arange(len(part[0]))
+        inside = there.good[0]
+        assert inside.sum() > 0.7 * known.rows
+        np.testing.assert_allclose(begins.residuals[0][inside], told[numbers[inside]], rtol=0.0, atol=1e-9)
+
+
 def test_what_is_likelier_than_not_is_named_and_what_a_part_contradicts_is_not() -> None:
     assert shares({DRY: 0.9}, [{DRY: 0.9}, {DRY: 0.9}]) == {DRY: pytest.approx(SUREST)}
     assert shares({DRY: 0.9}, [{DRY: 0.4}, {DRY: 0.6}]) == {DRY: pytest.approx(1.5**2 / (1.0 + 1.5**2))}
@@ -70,13 +96,13 @@ def test_what_is_likelier_than_not_is_named_and_what_a_part_contradicts_is_not()
     assert shares({DRY: 0.9}, [{DRY: math.nan}, {DRY: math.nan}]) == {DRY: pytest.approx(0.9)}
     assert shares({DRY: 0.97}, [{DRY: 0.97}, {}]) == {}
     assert shares({DRY: 0.4}, [{DRY: 0.45}, {DRY: 0.4}]) == {}
-    assert shares({DRY: 0.9}, [{DRY: math.nan}, {DRY: 0.9}]) == {DRY: pytest.approx(SUREST)}  # one cannot tell
+    assert shares({DRY: 0.9}, [{DRY: math.nan}, {DRY: 0.9}]) == {DRY: pytest.approx(0.9)}  # one cannot tell
 
 
 def test_a_part_without_the_moment_at_which_an_effect_begins_is_not_asked() -> None:
     both = [{}, {STEP: 0.9}]
     # 10 s lie within the first fifth
-    assert shares({STEP: 0.9}, both, {STEP: [(0, 10.0)]}) == {STEP: pytest.approx(SUREST)}
+    assert shares({STEP: 0.9}, both, {STEP: [(0, 10.0)]}) == {STEP: pytest.approx(0.9)}
     assert shares({STEP: 0.9}, both, {STEP: [(0, 50.0)]}) == {}
     assert tells((recorded(1000),), [])
 

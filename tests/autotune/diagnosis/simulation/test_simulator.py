@@ -175,10 +175,10 @@ def test_dry_friction_alone_is_simulated_as_beside_a_load_of_nothing(
 def test_a_recording_of_which_no_row_counts_says_nothing_of_the_states_sizes() -> None:
     sim = assemble(servo())
     u, y = np.array([0.0, 1.0, 0.0]), np.array([0.0, 2.0, 1.0])
-    alone, nothing = sim.state_sizes(*spans_of([u], [y])), y[:0]
-    assert np.array_equal(sim.state_sizes(*spans_of([u, u], [nothing, y])), alone)
-    assert np.array_equal(sim.state_sizes(*spans_of([u, u], [y, nothing])), alone)
-    assert np.all(np.isfinite(sim.state_sizes(*spans_of([u], [nothing]))))
+    alone, nothing = sim.state_sizes(*spans_of([u], [y]), 0.1), y[:0]
+    assert np.array_equal(sim.state_sizes(*spans_of([u, u], [nothing, y]), 0.1), alone)
+    assert np.array_equal(sim.state_sizes(*spans_of([u, u], [y, nothing]), 0.1), alone)
+    assert np.all(np.isfinite(sim.state_sizes(*spans_of([u], [nothing]), 0.1)))
 
 
 @settings(max_examples=30)
@@ -212,8 +212,29 @@ def test_rest_and_sizes_of_states_are_in_proportion_to_the_signals(
     units = np.array([v, m, m / s])  # of the lag's state, of the angle and of its rate
     there, here = spring(s, v, m), spring(1.0, 1.0, 1.0)
     # a reading that no rest under the command has: what gives way hangs on no unit
-    np.testing.assert_allclose(there.rest_state(0.7 * v, y * m), units * here.rest_state(0.7, y), rtol=1e-9, atol=0.0)
-    np.testing.assert_allclose(there.state_sizes(2.0 * v, 0.1 * m), units * here.state_sizes(2.0, 0.1), rtol=1e-9)
+    for dt in (0.01, 1.0):  # a sample shorter than what is fastest, and one longer
+        at_rest, sizes = there.rest_state(0.7 * v, y * m, dt * s), there.state_sizes(2.0 * v, 0.1 * m, dt * s)
+        np.testing.assert_allclose(at_rest, units * here.rest_state(0.7, y, dt), rtol=1e-9, atol=0.0)
+        np.testing.assert_allclose(sizes, units * here.state_sizes(2.0, 0.1, dt), rtol=1e-9)
+
+
+@given(shorter=st.floats(1.0, 7.0), u=st.floats(-1.0, 1.0), y=st.floats(-1.0, 1.0))
+def test_a_lag_far_faster_than_a_sample_moves_no_other_state(shorter: float, u: float, y: float) -> None:
+    """A ball's height integrates its speed: what a sensor does within a sample says nothing of how far they go."""
+
+    def ball(lag_s: float) -> Simulator:
+        chain = [("plant", (-65.5,), (0.36, 1.0)), ("plant", (1.0,), (1.0, 0.0)), ("sensor", (1.0,), (lag_s, 1.0))]
+        blocks = [
+            Block(name=f"{i}", place=where, dynamics=TransferFunction(num=num, den=den))
+            for i, (where, num, den) in enumerate(chain)
+        ]
+        return assemble(Model(name="ball", input=Port(), output=Port(), blocks=tuple(blocks)))
+
+    dt = 0.01
+    fast, faster = ball(0.01 * dt), ball(0.01 * dt * 0.1**shorter)
+    np.testing.assert_allclose(faster.state_sizes(1.0, 0.1, dt), fast.state_sizes(1.0, 0.1, dt), rtol=1e-3)
+    np.testing.assert_allclose(faster.state_sizes(0.0, 0.1, dt)[:2], fast.state_sizes(0.0, 0.1, dt)[:2], rtol=1e-2)
+    np.testing.assert_allclose(faster.rest_state(u, y, dt), fast.rest_state(u, y, dt), rtol=1e-3, atol=1e-9)
 
 
 @pytest.mark.parametrize("name", [name for name, kind in KINDS.items() if kind.linear and kind.linear.start])
