@@ -20,6 +20,8 @@ from autotune.errors import AutotuneError, IdentificationError
 TOLERANCE = 0.05
 #: Damping below which a small decrease means that the bottom is reached.
 SETTLED = 1e-7
+#: Inverse variance of a start state beside where it is, in units of its size: what is not felt stays in place.
+STATE_PRIOR = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,9 +176,8 @@ def _freed(left: FloatArray, Jx: FloatArray, first: IntArray, last: IntArray, da
     for w in range(first.size):
         X, Y = Jx[first[w] : last[w]], left[first[w] : last[w]]
         G = X.T @ X
-        # a little of the prior that start states are of the signals' size keeps unfelt ones in place
         for i in range(n):
-            G[i, i] += 1e-2 + (damping + 1e-10) * G[i, i]
+            G[i, i] += STATE_PRIOR + (damping + 1e-10) * G[i, i]
         gains[w] = np.linalg.solve(G, X.T @ Y)
         Y -= X @ gains[w]
     return gains

@@ -18,6 +18,7 @@ from autotune.arrays import BoolArray, FloatArray, IntArray
 from autotune.diagnosis.fitting.bases import basis
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.descent import (
+    STATE_PRIOR,
     Derivatives,
     Iterate,
     Problem,
@@ -108,10 +109,11 @@ class Fit:
         """The same as ``explained`` for the start state of every window: (L, m) arrays."""
         return tuple(basis(self.jacobian[1][a:b]) for a, b in self.windows)
 
-    @property
-    def free_states(self) -> int:
-        """How many start states all windows have: each takes 1 of chi2 from noise alone, if it is felt at all."""
-        return len(self.windows) * int(self.jacobian[1].shape[1])
+    @cached_property
+    def free_states(self) -> float:
+        """How many start states the windows have, each as far as it is felt beside its prior: 1 of chi2 from noise."""
+        squares = (np.linalg.svd(self.jacobian[1][a:b], compute_uv=False) ** 2 for a, b in self.windows)
+        return float(sum(np.sum(each / (each + STATE_PRIOR)) for each in squares))
 
     def without_states(self, direction: FloatArray) -> FloatArray:
         """Return what is left of a whitened direction when all start states may move against it."""

@@ -79,7 +79,8 @@ def search_chain(
         if known:
             cuts[-1] = within(known[0].data, recordings, good)
             few = within(known[0].few, recordings, good) if len(cuts) == 1 else few
-        bench = Bench(cuts=tuple(cuts), few=few, odds=_odds(model, recordings, left_out), pool=pool)
+        odds = _odds(model, recordings, left_out) if known is None else ()  # what is known has its odds
+        bench = Bench(cuts=tuple(cuts), few=few, odds=odds, pool=pool)
         return search(_begin(model, bench), progress, known)
 
 
