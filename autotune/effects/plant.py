@@ -552,7 +552,7 @@ PLANT = (
             Quantity(name="width", unit="{y}", role="shape", nonzero=True),
         ),
         lines=(Line(stage="force", does=_held_back), Line(stage="travel", does=turn)),
-        memory=Memory(name="turned", start="zero"),
+        memory=Memory(name="turned", start="travel"),
         starts=lambda s: [(0.05 * s.f, c * s.x) for c in (0.05, 0.3)],
         rough=True,
         stand_in=_is_friction_or_spring,

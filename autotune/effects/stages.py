@@ -87,14 +87,15 @@ class Memory:
     ----------
     name : str
         The lines' argument.
-    start : {"command", "zero"}
-        What it is where a window begins that follows no other: the command in force there, or 0.
+    start : {"command", "travel"}
+        What it is where a window begins that follows no other: the command in force there, or what the simulation's
+        travel since the first window's beginning, where it is 0, has made of it.
     replayed : bool
         Whether it remembers every command before the window, as a play does.
     """
 
     name: str
-    start: Literal["command", "zero"] = "command"
+    start: Literal["command", "travel"] = "command"
     replayed: bool = False
 
 

@@ -186,7 +186,7 @@ class EffectLine(LawLine):
         travel = next((line for line in self.kind.lines if line.stage == "travel"), None)
         from_origin, asks, result = np.asarray(x - self.origin), self.asks, np.empty(x.size)
         name = memory.name if memory is not None else ""
-        held = 0.0 if memory is not None and memory.start == "zero" else float(from_origin[0])
+        held = 0.0 if memory is not None and memory.start == "travel" else float(from_origin[0])
         given = self._constants(number) | {name: held}
         before = float(from_origin[0])
         for k, value in enumerate(from_origin.tolist()):

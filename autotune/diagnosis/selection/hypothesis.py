@@ -8,6 +8,7 @@ import numpy as np
 
 from autotune.diagnosis.fitting.data import Data
 from autotune.diagnosis.fitting.fit import Fit
+from autotune.diagnosis.fitting.retuning import under_noise
 from autotune.effects import kind_of
 from autotune.effects.base import Fitted
 
@@ -46,9 +47,10 @@ def is_stand_in(h: Hypothesis, data: Data) -> bool:
         return False
     positions = np.concatenate([signals[:, 2] for signals in h.fit.signals])
     travelled = float(np.nanmax(positions) - np.nanmin(positions))
+    noise_sd = under_noise(h.fit, data).noise.total_sd  # a fit's unit may be model error, much beside what is noise
     for effect, kind in able:
         fitted = Fitted(
-            values=effect.values, travelled=travelled, noise_sd=data.noise.total_sd,
+            values=effect.values, travelled=travelled, noise_sd=noise_sd,
             mechanical=h.fit.sim.chain.is_mechanical,
         )  # fmt: skip
         if kind.stand_in is not None and kind.stand_in(fitted):

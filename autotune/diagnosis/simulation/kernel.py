@@ -51,8 +51,8 @@ SIGNALS = 4
 #: Positions in the vector of integers, before those that say which effects act.
 (
     NUMBER, SIGNALS_ASKED, LINEAR_HOLD, DIRECTIONAL, ACTUATOR, SPEED_STATE, POSITION_STATE, FORCED, SMOOTH, RUBBING,
-    DRAINING, STOPPED, SENSING, PLAIN, DRY, REPLAYED, ROWS, FLAGS
-) = range(18)  # fmt: skip
+    DRAINING, STOPPED, SENSING, PLAIN, DRY, REPLAYED, TRAVELLED, ROWS, FLAGS
+) = range(19)  # fmt: skip
 
 
 class _Linear(NamedTuple):
@@ -251,7 +251,7 @@ def run(
     linear = _Linear(np.empty((4, n, n + INPUTS)), np.full(4, -1.0), taps, numbers, flags)
     work = _Work(np.empty(n), np.empty(n), np.empty(n), np.empty(n))
     M, x, free = linear.M, work.x, work.free
-    memory = np.zeros(MEMORIES + 1)
+    memory, began = np.zeros(MEMORIES + 1), np.zeros(MEMORIES + 1)
     carried = np.full(MEMORIES + 1, u[0] - numbers[U_OFFSET])
     effects = Effects(numbers, flags[FLAGS:], memory)
     before = Effects(numbers, flags[FLAGS:], carried)
@@ -275,20 +275,33 @@ def run(
         while flags[REPLAYED] and past <= j:
             command(converter(u[past], 0.0, before) - u_offset, u_offset, 0.0, 0.0, flags[NUMBER], before)
             past += 1
-        begin(w, window > 0 and rows[1, window - 1] == first, carried, effects)
-        at = rows[2, window] - first
-        for k in range(first, last):
-            z = _tap(taps, OUTPUT, x) + numbers[DIRECT_OUT] * w
-            since = t[k] - t[0]
-            if flags[SENSING]:
-                through = numbers[LAW] * (_tap(taps, PLANT_IN, x) + numbers[DIRECT_IN] * w)
-                out[0, at + k] = reading(sensor(z, since, through, effects) + y_offset, since, effects)
-            else:
-                out[0, at + k] = z + y_offset
-            if out.shape[0] > 1:
-                out[1, at + k] = _tap(taps, SPEED, x)
-                out[2, at + k] = _tap(taps, POSITION, x)
-                out[3, at + k] = _tap(taps, PLANT_IN, x) + numbers[DIRECT_IN] * w
+        begin(w, window > 0 and (flags[TRAVELLED] or rows[1, window - 1] == first), carried, effects)
+        at, beyond = rows[2, window] - first, last
+        if flags[TRAVELLED]:
+            # some effects remember how the plant moved: on through the rows that lie between windows
+            again = window > 0 and rows[0, window - 1] == first
+            for i in range(memory.size):
+                if again:
+                    memory[i] = began[i]
+                began[i] = memory[i]
+            if window + 1 < rows.shape[1]:
+                beyond = max(last, rows[0, window + 1])
+        for k in range(first, beyond):
+            if k < last:
+                z = _tap(taps, OUTPUT, x) + numbers[DIRECT_OUT] * w
+                since = t[k] - t[0]
+                if flags[SENSING]:
+                    through = numbers[LAW] * (_tap(taps, PLANT_IN, x) + numbers[DIRECT_IN] * w)
+                    out[0, at + k] = reading(sensor(z, since, through, effects) + y_offset, since, effects)
+                else:
+                    out[0, at + k] = z + y_offset
+                if out.shape[0] > 1:
+                    out[1, at + k] = _tap(taps, SPEED, x)
+                    out[2, at + k] = _tap(taps, POSITION, x)
+                    out[3, at + k] = _tap(taps, PLANT_IN, x) + numbers[DIRECT_IN] * w
+            elif k == last:
+                for i in range(n):
+                    states[1, window, i] = x[i]
             if k + 1 >= N:
                 break
             now = t[k]
@@ -334,6 +347,7 @@ def run(
                     if flags[STOPPED]:
                         _stop(x, linear, effects)
                 now = until
-        for i in range(n):
-            states[1, window, i] = x[i]
+        if beyond == last:
+            for i in range(n):
+                states[1, window, i] = x[i]
     return out

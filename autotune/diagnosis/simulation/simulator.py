@@ -322,7 +322,8 @@ def _told(
         int(any(_acts_at(kind, "sensor", "reading") for kind in kinds)),
         int(not (forced or driven or directional or linear_hold)),
         int(rubbed and not (driven or directional or linear_hold)),
-        int(any(kind.memory is not None and kind.memory.replayed for kind in kinds)), 0,
+        int(any(kind.memory is not None and kind.memory.replayed for kind in kinds)),
+        int(any(kind.memory is not None and kind.memory.start == "travel" for kind in kinds)), 0,
     )  # fmt: skip
     return np.array(told, dtype=np.int64)
 

@@ -191,6 +191,23 @@ def test_a_cogging_torque_that_was_travelled_over_is_no_stand_in() -> None:
     assert found.chosen.fit.model.effects[0].parameters["period"].value == pytest.approx(1.0, rel=0.01)
 
 
+def test_a_hysteresis_has_its_numbers_where_rows_are_left_out_between_windows() -> None:
+    amplitude, width = 0.15, 0.3
+    turned, before = 0.0, 0.0
+
+    def force(x: float, v: float) -> float:
+        nonlocal turned, before
+        travel, before = (x - before) / width, x
+        turned += travel - abs(travel) * turned
+        return -amplitude * turned
+
+    r = servo_recording(5, force, rows=16000)
+    left_out = [k.name for k in ALL if k.name not in ("plant.hysteresis", "plant.coulomb_friction", "plant.resonance")]
+    found = search_chain(servo_model(), [r], [np.ones(len(r), dtype=bool)], left_out)
+    assert found.chosen.names == ("plant.hysteresis",)
+    assert found.chosen.added[0].values == pytest.approx({"amplitude": amplitude, "width": width}, rel=0.05)
+
+
 def test_of_a_long_recording_some_windows_tell_the_same() -> None:
     rows, decay = 3000, float(np.exp(-0.1))
     rng = np.random.default_rng(2)

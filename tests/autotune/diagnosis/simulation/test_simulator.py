@@ -124,6 +124,20 @@ def test_windows_that_start_where_the_one_before_ended_are_one_free_run() -> Non
     np.testing.assert_allclose(second[400:], whole[400:], atol=1e-12)
 
 
+def test_a_hysteresis_goes_on_through_rows_between_windows() -> None:
+    """Windows that begin where the free run was are parts of it, wherever they end, and however many begin together."""
+    rng = np.random.default_rng(3)
+    r, start = recording(np.repeat(rng.normal(size=40), 20), 0.005), np.array([0.1, 0.2, 0.3])
+    sim = assemble(servo(effects=(effect("plant.hysteresis", amplitude=0.8, width=0.4),)))
+    whole, _ = sim.run(r, start)
+    first, some = np.array([0, 300, 300, 550]), np.array([100, 300, 420, 700])
+    states = [sim.run(r, start, Windows(starts=np.array([0]), stops=np.array([k])))[1][0] for k in first]
+    parts, ends = sim.run(r, np.array(states), Windows(starts=first, stops=some))
+    for a, b in zip(first, some, strict=True):
+        np.testing.assert_allclose(parts[a:b], whole[a:b], atol=1e-12)
+    np.testing.assert_allclose(ends[1], states[1], atol=0.0)
+
+
 def test_an_effect_that_the_chain_has_no_place_for_is_refused() -> None:
     tank = Model(
         name="tank",
