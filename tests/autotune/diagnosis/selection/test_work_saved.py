@@ -60,7 +60,8 @@ def test_a_sensor_s_start_states_are_paid_for_however_little_they_are_felt(lag_s
         for added in ([], [sensor])
     )
     paid = beside.penalised_chi2 - beside.fit.cost - (alone.penalised_chi2 - alone.fit.cost)
-    assert paid == pytest.approx(np.log(ROWS) + ROWS / WINDOW)  # a number, and a state in every window
+    # a number, and a state in every window, but for what its prior of ten sizes holds back of it
+    assert paid == pytest.approx(np.log(ROWS) + ROWS / WINDOW, abs=1e-3)
 
 
 @pytest.mark.parametrize(("lag_s", "does_nothing"), [(0.3, False), (1e-2, False), (1e-5, True), (1e-9, True)])
