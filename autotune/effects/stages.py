@@ -87,16 +87,14 @@ class Memory:
     ----------
     name : str
         The lines' argument.
-    start : {"command", "travel"}
-        What it is where a window begins that follows no other: the command in force there, or what the simulation's
-        travel since the first window's beginning, where it is 0, has made of it.
-    replayed : bool
-        Whether it remembers every command before the window, as a play does.
+    start : {"command", "replay", "travel"}
+        What it is where a window begins that follows no other: the command in force there; what every command before
+        has made of it, as of a play; what the simulation's travel has made of it since the first window's beginning,
+        where it is 0.
     """
 
     name: str
-    start: Literal["command", "travel"] = "command"
-    replayed: bool = False
+    start: Literal["command", "replay", "travel"] = "command"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,8 +20,9 @@ from autotune.errors import AutotuneError, IdentificationError
 TOLERANCE = 0.05
 #: Damping below which a small decrease means that the bottom is reached.
 SETTLED = 1e-7
-#: Inverse variance of a start state beside where it is, in units of its size: what is not felt stays in place.
-STATE_PRIOR = 1e-2
+#: Inverse variance of a start state beside where it is, in units of its size: what is not felt stays in place. Share of
+#: what is felt of a state that is added to it: equations of two that are felt alike can be solved.
+STATE_PRIOR, ALIKE = 1e-2, 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +178,7 @@ def _freed(left: FloatArray, Jx: FloatArray, first: IntArray, last: IntArray, da
         X, Y = Jx[first[w] : last[w]], left[first[w] : last[w]]
         G = X.T @ X
         for i in range(n):
-            G[i, i] += STATE_PRIOR + (damping + 1e-10) * G[i, i]
+            G[i, i] += STATE_PRIOR + (damping + ALIKE) * G[i, i]
         gains[w] = np.linalg.solve(G, X.T @ Y)
         Y -= X @ gains[w]
     return gains

@@ -199,7 +199,7 @@ def _begin(layout: Layout) -> str:
         if kind.memory is None:
             continue
         place = layout.memories[kind.name]
-        if kind.memory.replayed:
+        if kind.memory.start == "replay":
             rows.append(f"    effects.memory[{place}] = carried[{place}]")
         else:
             rows.append(f"    if not follows:\n        effects.memory[{place}] = {_start(kind)}")

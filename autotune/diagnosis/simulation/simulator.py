@@ -295,6 +295,8 @@ SLOWEST, GROWTH = 1e-3, 1.3
 _FORCED: tuple[StageName, ...] = tuple(name for name, stage in STAGES.items() if stage.is_force)
 #: Stages that the body asks for one by one.
 _TOLD: tuple[StageName, ...] = ("force", "friction", "outflow", "stop")
+#: What memories begin with that the body sees to: commands before a window, rows between windows.
+_STARTS = ("replay", "travel")
 
 
 def _acts_at(kind: EffectKind, *names: StageName) -> bool:
@@ -322,8 +324,7 @@ def _told(
         int(any(_acts_at(kind, "sensor", "reading") for kind in kinds)),
         int(not (forced or driven or directional or linear_hold)),
         int(rubbed and not (driven or directional or linear_hold)),
-        int(any(kind.memory is not None and kind.memory.replayed for kind in kinds)),
-        int(any(kind.memory is not None and kind.memory.start == "travel" for kind in kinds)), 0,
+        *(int(any(kind.memory is not None and kind.memory.start == start for kind in kinds)) for start in _STARTS), 0,
     )  # fmt: skip
     return np.array(told, dtype=np.int64)
 
